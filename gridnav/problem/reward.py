@@ -1,0 +1,165 @@
+"""One reward for all worlds: pure terms on arrays and their sum.
+
+Lengths are in cells and times in cell-times (the time to cross a cell at the reference speed), so that a grid move and
+the same way driven by a robot earn about the same. With ``dc`` cells travelled, ``dt`` cell-times passed and ``D`` the
+distance to the goal in cells::
+
+    r = goal - collision_cost*hit - distance_cost*dc - time_cost*dt + progress*(gamma^dt * phi(s') - phi(s)),  phi = -D
+
+phi is 0 in terminal states and never zeroed at a truncation (Ng, Harada and Russell 1999; Grzes 2017).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import ClassVar
+
+import numpy as np
+
+from gridnav.problem.types import BoolArray, FloatArray, InputError
+
+TERM_NAMES = ("goal", "collision", "distance", "time", "progress")
+
+
+@dataclass(frozen=True)
+class Transition:
+    """What the reward looks at: one step of ``n`` worlds, each field of shape ``(n,)``."""
+
+    travelled: FloatArray
+    """Cells travelled."""
+    duration: FloatArray
+    """Cell-times passed."""
+    distance: FloatArray
+    """Shortest way to the goal before the step, cells."""
+    next_distance: FloatArray
+    """The same after the step, cells, whether or not the state is terminal."""
+    manhattan: FloatArray
+    """Rows plus columns between the cell after the step and the goal."""
+    at_goal: BoolArray
+    """The goal was reached."""
+    hit: BoolArray
+    """A wall was touched or bumped into."""
+    hit_inner_wall: BoolArray
+    """It was a wall of the layout, not the outer one."""
+    terminal: BoolArray
+    """The state after the step is final: the goal, or a collision that ends the episode."""
+    time_up: BoolArray
+    """The time limit was reached with this step."""
+
+
+@dataclass(frozen=True)
+class Reward:
+    """Weights of the reward's terms; the class is the default reward itself.
+
+    Idling must not pay: standing still at distance D earns ``progress*D*(1 - gamma)`` and costs ``time_cost`` per
+    cell-time, so the time cost has to exceed the former for every D of the layout (50 cells with the defaults).
+    ``gridnav lint-reward`` checks it.
+    """
+
+    goal: float = 10.0
+    """Paid once at the goal."""
+    collision_cost: float = 2.0
+    """Charged for every step with a collision."""
+    distance_cost: float = 0.05
+    """Charged per cell travelled."""
+    time_cost: float = 0.25
+    """Charged per cell-time."""
+    progress: float = 0.5
+    """Weight of the potential-based progress, reward per cell."""
+    gamma: float = 0.99
+    """Discount per cell-time, in (0, 1]; learners that follow it discount a step by ``gamma**dt``."""
+
+    PRESETS: ClassVar[dict[str, type[Reward]]] = {}
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+                raise InputError(f"reward {item.name} {value!r} must be a finite number")
+        if not 0.0 < self.gamma <= 1.0:
+            raise InputError(f"reward gamma {self.gamma} is outside (0, 1]: it is the discount per cell-time")
+
+    @classmethod
+    def preset(cls, name: str) -> Reward:
+        """The named reward: ``default``, or ``seed``, the tutorial's reward of the 10 x 10 grid.
+
+        Raises:
+            InputError: When no preset has that name.
+        """
+        if not isinstance(name, str) or name not in cls.PRESETS:
+            raise InputError(f"unknown reward {name!r}: the presets are {', '.join(cls.PRESETS)}")
+        return cls.PRESETS[name]()
+
+    @classmethod
+    def load(cls, source: str | Reward) -> Reward:
+        """A reward from a preset's name or itself."""
+        return source if isinstance(source, Reward) else cls.preset(source)
+
+    def terms(self, step: Transition) -> dict[str, FloatArray]:
+        """Each term's share of the reward, by the names of ``TERM_NAMES``, shape ``(n,)`` each."""
+        return {
+            "goal": self.goal * step.at_goal,
+            "collision": -self.collision_cost * step.hit,
+            "distance": -self.distance_cost * step.travelled,
+            "time": -self.time_cost * step.duration,
+            "progress": self.progress * progress(step, self.gamma),
+        }
+
+
+def progress(step: Transition, gamma: float) -> FloatArray:
+    """Getting closer to the goal along the free way: ``gamma**dt * phi(s') - phi(s)`` with ``phi = -distance``.
+
+    Potential-based, so it leaves the optimal policy as it was (Ng, Harada and Russell 1999, Theorem 1); phi is 0 in
+    terminal states, as the theorem asks.
+
+    Args:
+        step: The transition of ``n`` worlds.
+        gamma: Discount per cell-time.
+
+    Returns:
+        Shape ``(n,)``, cells.
+    """
+    next_distance = np.where(step.terminal, 0.0, step.next_distance)
+    return step.distance - gamma**step.duration * next_distance
+
+
+def total(terms: dict[str, FloatArray]) -> FloatArray:
+    """The reward: the sum of its terms, shape ``(n,)``."""
+    return np.sum(list(terms.values()), axis=0)
+
+
+@dataclass(frozen=True)
+class TutorialReward(Reward):
+    """The reward of the tutorial's 10 x 10 grid, for comparison.
+
+    Every move -0.1 plus closeness 0.1*(20 - d)/20 with d the Manhattan distance after it; into a wall cell -1; goal
+    +10; the move that ends the time -1 whatever else it did. On a robot the ordinary part is paid per cell-time.
+    """
+
+    goal: float = 10.0
+    """Paid instead of the ordinary reward at the goal."""
+    collision_cost: float = 1.0
+    """Charged instead of the ordinary reward for a move into a wall of the layout."""
+    distance_cost: float = 0.0
+    """Not part of this reward."""
+    time_cost: float = 0.1
+    """Charged per move."""
+    progress: float = 0.1
+    """Paid per move for closeness, in full at the goal and nothing 20 cells away."""
+    gamma: float = 0.99
+    """The tutorial's default discount per move."""
+
+    def terms(self, step: Transition) -> dict[str, FloatArray]:
+        """Each term's share of the reward, by the names of ``TERM_NAMES``, shape ``(n,)`` each."""
+        ordinary = ~(step.at_goal | step.hit_inner_wall | step.time_up)
+        closeness = self.progress * (20.0 - step.manhattan) / 20.0
+        return {
+            "goal": self.goal * (step.at_goal & ~step.time_up),
+            "collision": -self.collision_cost * (step.hit_inner_wall & ~step.time_up),
+            "distance": np.zeros_like(step.travelled),
+            "time": np.where(step.time_up, -1.0, -self.time_cost * step.duration * ordinary),
+            "progress": closeness * step.duration * ordinary,
+        }
+
+
+Reward.PRESETS.update(default=Reward, seed=TutorialReward)
