@@ -123,7 +123,7 @@ class Geodesic:
         return lengths
 
 
-def clearances(points_w: FloatArray, layout: Layout) -> tuple[FloatArray, FloatArray]:
+def clearances(points_w: FloatArray, layout: Layout) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Distance of points to the nearest wall, the outer wall included, and the direction to it.
 
     Only walls within one cell of the point's own are looked at: beyond, the distance reads one cell.
@@ -133,13 +133,13 @@ def clearances(points_w: FloatArray, layout: Layout) -> tuple[FloatArray, FloatA
         layout: The maze.
 
     Returns:
-        Distance in metres, shape ``(n,)``, 0 inside a wall; unit vectors to the nearest wall point, world
-        frame, shape ``(n, 2)``.
+        Distance in metres, 0 inside a wall, shape ``(n,)``; unit vectors to the nearest wall point, world frame,
+        shape ``(n, 2)``; whether it belongs to an inner wall, shape ``(n,)``.
     """
-    points_w = np.ascontiguousarray(points_w, dtype=np.float64)
-    distance, direction = np.empty(len(points_w)), np.empty((len(points_w), 2))
-    _clearances(points_w, layout.walls, layout.cell_size_m, distance, direction)
-    return distance, direction
+    n = len(points_w)
+    distance, direction, inner = np.empty(n), np.empty((n, 2)), np.empty(n, dtype=np.bool_)
+    _clearances(np.ascontiguousarray(points_w), layout.walls, layout.cell_size_m, distance, direction, inner)
+    return distance, direction, inner
 
 
 def _anchors(layout: Layout, radius_m: float) -> FloatArray:
@@ -159,7 +159,7 @@ def _anchors(layout: Layout, radius_m: float) -> FloatArray:
             corner = np.array([col, layout.n_rows - row]) * layout.cell_size_m
             points.append(corner + reach * np.stack([np.cos(away + spread), np.sin(away + spread)], axis=1))
     anchors = np.concatenate(points) if points else np.empty((0, 2))
-    distance, _ = clearances(anchors, layout)
+    distance, _, _ = clearances(anchors, layout)
     return np.ascontiguousarray(anchors[distance >= radius_m - TOLERANCE_M])
 
 
@@ -264,30 +264,35 @@ def _segment_box(
 
 
 @numba.njit(cache=True)
-def _clearances(points: FloatArray, walls: BoolArray, cell: float, distance: FloatArray, direction: FloatArray) -> None:
-    n_rows, n_cols = walls.shape
+def _clearances(
+    points: FloatArray, walls: BoolArray, cell: float, distance: FloatArray, direction: FloatArray, inner: BoolArray
+) -> None:
     for i in range(len(points)):
-        x, y = points[i]
-        nearest = cell
-        to_x, to_y = 1.0, 0.0
-        for gap, ux, uy in (
-            (x, -1.0, 0.0),
-            (n_cols * cell - x, 1.0, 0.0),
-            (y, 0.0, -1.0),
-            (n_rows * cell - y, 0.0, 1.0),
-        ):
-            if gap < nearest:
-                nearest, to_x, to_y = max(gap, 0.0), ux, uy
-        col, band = int(np.floor(x / cell)), int(np.floor(y / cell))
-        for b in range(max(band - 1, 0), min(band + 2, n_rows)):
-            for c in range(max(col - 1, 0), min(col + 2, n_cols)):
-                if walls[n_rows - 1 - b, c]:
-                    dx = min(max(x, c * cell), (c + 1) * cell) - x
-                    dy = min(max(y, b * cell), (b + 1) * cell) - y
-                    gap = np.hypot(dx, dy)
-                    if gap < nearest:
-                        nearest = gap
-                        if gap > 0.0:
-                            to_x, to_y = dx / gap, dy / gap
-        distance[i] = nearest
-        direction[i, 0], direction[i, 1] = to_x, to_y
+        distance[i], direction[i, 0], direction[i, 1], inner[i] = clearance(points[i, 0], points[i, 1], walls, cell)
+
+
+@numba.njit(cache=True)
+def clearance(x: float, y: float, walls: BoolArray, cell: float) -> tuple[float, float, float, bool]:
+    """``clearances`` of one point, for compiled loops: distance, direction x and y, whether the wall is an inner one."""
+    n_rows, n_cols = walls.shape
+    nearest, to_x, to_y, inner = cell, 1.0, 0.0, False
+    for gap, ux, uy in (
+        (x, -1.0, 0.0),
+        (n_cols * cell - x, 1.0, 0.0),
+        (y, 0.0, -1.0),
+        (n_rows * cell - y, 0.0, 1.0),
+    ):
+        if gap < nearest:
+            nearest, to_x, to_y = max(gap, 0.0), ux, uy
+    col, band = int(np.floor(x / cell)), int(np.floor(y / cell))
+    for b in range(max(band - 1, 0), min(band + 2, n_rows)):
+        for c in range(max(col - 1, 0), min(col + 2, n_cols)):
+            if walls[n_rows - 1 - b, c]:
+                dx = min(max(x, c * cell), (c + 1) * cell) - x
+                dy = min(max(y, b * cell), (b + 1) * cell) - y
+                gap = np.hypot(dx, dy)
+                if gap < nearest:
+                    nearest, inner = gap, True
+                    if gap > 0.0:
+                        to_x, to_y = dx / gap, dy / gap
+    return nearest, to_x, to_y, inner

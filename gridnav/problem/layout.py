@@ -92,6 +92,8 @@ class Layout:
     """The starts as (row, column), shape ``(n_starts, 2)``, row by row."""
     goal_cells: IntArray = field(init=False, repr=False)
     """The goals as (row, column), shape ``(n_goals, 2)``, row by row."""
+    reachable: BoolArray = field(init=False, repr=False)
+    """True on the free cells that the starts reach, same shape as the walls."""
 
     def __post_init__(self) -> None:
         for mask in (self.walls, self.starts, self.goals):
@@ -315,6 +317,8 @@ class Layout:
             for row, col in cells:
                 if regions[row, col] != regions[tuple(start)]:
                     raise _UnreachableError(what, (int(row), int(col)), (int(start[0]), int(start[1])))
+        object.__setattr__(self, "reachable", regions == regions[tuple(start)])
+        self.reachable.setflags(write=False)
 
 
 class _UnreachableError(InputError):

@@ -22,9 +22,9 @@ class Task:
     """
 
     starts: Literal["layout", "any"] = "layout"
-    """Start cells: those of the layout, or every free cell."""
+    """Start cells: those of the layout, or every free cell that they reach."""
     goals: Literal["layout", "any"] = "layout"
-    """Goal cells: those of the layout, or every free cell."""
+    """Goal cells: those of the layout, or every free cell that the starts reach."""
     on_collision: Literal["stop", "slide", "end"] = "stop"
     """A robot that touches a wall is stopped for the rest of its control period, or slides on, or the episode ends.
 
@@ -56,11 +56,11 @@ class Task:
 
     def start_cells(self, layout: Layout) -> IntArray:
         """Cells where an episode may start, (row, column), shape ``(n_starts, 2)``."""
-        return np.argwhere(~layout.walls) if self.starts == "any" else layout.start_cells
+        return np.argwhere(layout.reachable) if self.starts == "any" else layout.start_cells
 
     def goal_cells(self, layout: Layout) -> IntArray:
         """Cells where an episode may end, (row, column), shape ``(n_goals, 2)``."""
-        return np.argwhere(~layout.walls) if self.goals == "any" else layout.goal_cells
+        return np.argwhere(layout.reachable) if self.goals == "any" else layout.goal_cells
 
     def sample(self, layout: Layout, uniforms: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
         """Starts, goals and headings of episodes.

@@ -1,0 +1,31 @@
+"""The worlds: grid, kinematic robot, MuJoCo robot. Importing this registers their ids with Gymnasium."""
+
+import gymnasium as gym
+
+from gridnav.envs.diff_drive import DiffDriveEnv, DiffDriveVectorEnv
+from gridnav.envs.grid_moves import GridMoves
+from gridnav.envs.grid_world import GridWorldEnv, GridWorldVectorEnv
+from gridnav.envs.observation import FeatureVector
+from gridnav.envs.unicycle import UnicycleEnv, UnicycleVectorEnv
+
+__all__ = [
+    "DiffDriveEnv",
+    "DiffDriveVectorEnv",
+    "FeatureVector",
+    "GridMoves",
+    "GridWorldEnv",
+    "GridWorldVectorEnv",
+    "UnicycleEnv",
+    "UnicycleVectorEnv",
+]
+
+MAX_EPISODE_STEPS = {"GridWorld": 100, "Unicycle": 500, "DiffDrive": 500}
+"""The time limit of each world: 100 moves, or 100 s of driving."""
+
+for _world, _file in (("GridWorld", "grid_world"), ("Unicycle", "unicycle"), ("DiffDrive", "diff_drive")):
+    gym.register(
+        id=f"gridnav/{_world}-v0",
+        entry_point=f"gridnav.envs.{_file}:{_world}Env",
+        vector_entry_point=f"gridnav.envs.{_file}:{_world}VectorEnv",
+        max_episode_steps=MAX_EPISODE_STEPS[_world],
+    )

@@ -1,0 +1,218 @@
+"""GridWorld: moves between cells."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.spaces import Discrete
+from gymnasium.vector import AutoresetMode
+
+from gridnav.envs.navigation import Motion, NavigationEnv, NavigationVectorEnv
+from gridnav.envs.painter import Painter
+from gridnav.problem.geodesic import cell_distances
+from gridnav.problem.grid_mdp import MOVE_HEADINGS_RAD, SIDEWAYS, MoveTable
+from gridnav.problem.types import AnyArray, BoolArray, FloatArray, InputError, IntArray
+
+ObservationMode = Literal["cell_goal", "cell", "features"]
+OBSERVATION_MODES = ("cell_goal", "cell", "features")
+
+
+class GridWorldVectorEnv(NavigationVectorEnv):
+    """``num_envs`` robots on the grid, stepped as arrays; see ``GridWorldEnv`` for the page of the environment."""
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "render_modes": ["ansi", "rgb_array", "human"],
+        "render_fps": 10,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
+    world = "GridWorld"
+
+    def __init__(
+        self, num_envs: int = 1, *, observation: ObservationMode = "cell_goal", slip: float = 0.0, **shared: Any
+    ) -> None:
+        if observation not in OBSERVATION_MODES:
+            raise InputError(f"observation {observation!r} is none of {', '.join(OBSERVATION_MODES)}")
+        if not 0.0 <= slip <= 1.0:
+            raise InputError(f"slip {slip} is outside [0, 1]: it is the probability of going sideways")
+        self.observation, self.slip = observation, float(slip)
+        self._painter: Painter | None = None
+        super().__init__(num_envs, **shared)
+
+    @property
+    def step_duration(self) -> float:
+        """A move takes one cell-time."""
+        return 1.0
+
+    def _spaces(self) -> tuple[gym.Space[Any], gym.Space[Any]]:
+        spaces: dict[str, gym.Space[Any]] = {
+            "cell_goal": Discrete(self.layout.n_cells * len(self.goal_cells)),
+            "cell": Discrete(self.layout.n_cells),
+            "features": self._features.space,
+        }
+        return spaces[self.observation], Discrete(4)
+
+    def _use_layout(self) -> None:
+        super()._use_layout()
+        self._table = MoveTable.of(self.layout)
+        self._position = np.zeros(self.num_envs, dtype=np.int64)  # number of the cell, row by row
+        self._centres = self.layout.to_metres(
+            np.stack(np.divmod(np.arange(self.layout.n_cells), self.layout.n_cols), axis=1)
+        )
+        # Place of each cell among the goals, -1 where it is none; and, per goal met so far, distances from all cells.
+        self._goal_rank = np.full(self.layout.n_cells, -1)
+        self._goal_rank[self._numbers(self.goal_cells)] = np.arange(len(self.goal_cells))
+        self._table_row = np.full(self.layout.n_cells, -1)
+        self._moves_to_goal = np.empty((0, self.layout.n_cells))
+
+    def _numbers(self, cells: IntArray) -> IntArray:
+        return cells[..., 0] * self.layout.n_cols + cells[..., 1]
+
+    def _checked_options(self, options: dict[str, Any] | None) -> Any:
+        fixed, layout = super()._checked_options(options)
+        goals = self.task.goal_cells(layout or self.layout)
+        if self.observation == "cell_goal":
+            if "goal" in fixed and not (goals == fixed["goal"]).all(axis=1).any():
+                raise InputError(
+                    f"reset option goal {tuple(fixed['goal'].tolist())} is no goal of this task, which cell_goal "
+                    'observations cannot name: use task="any" or another observation'
+                )
+            if len(goals) != len(self.goal_cells):
+                raise InputError(
+                    f"reset option layout has {len(goals)} goals, the environment {len(self.goal_cells)}: cell_goal "
+                    "observations need the same number"
+                )
+        return fixed, layout
+
+    def _place(self, ids: IntArray) -> None:
+        self._position[ids] = self._numbers(self._start[ids])
+        for goal in np.unique(self._numbers(self._goal[ids])):
+            if self._table_row[goal] < 0:
+                self._table_row[goal] = len(self._moves_to_goal)
+                row = cell_distances(self.layout, divmod(int(goal), self.layout.n_cols)).ravel()
+                self._moves_to_goal = np.concatenate([self._moves_to_goal, row[None]])
+
+    def _valid(self, actions: AnyArray) -> AnyArray:
+        array = np.asarray(actions)
+        if array.shape != (self.num_envs,) or array.dtype.kind not in "iu":
+            raise InputError(
+                f"action {_short(actions)} must be a whole number per environment, 0 up, 1 down, 2 left or 3 right"
+            )
+        if ((array < 0) | (array > 3)).any():
+            wrong = array[(array < 0) | (array > 3)][0]
+            raise InputError(f"action {wrong} is outside Discrete(4): 0 up, 1 down, 2 left, 3 right")
+        return array
+
+    def _drive(self, actions: AnyArray) -> Motion:
+        if self.slip > 0.0:
+            # Slip: with probability `slip` the move goes to one of its two sides, each as likely.
+            draws = self._streams.draw(np.arange(self.num_envs), 2)
+            side = SIDEWAYS[actions, (draws[:, 1] < 0.5).astype(np.int64)]
+            actions = np.where(draws[:, 0] < self.slip, side, actions)
+        before = self._position
+        hit = self._table.hit[before, actions]
+        self._position = self._table.next_cell[before, actions]
+        self._pose[:, :2] = self._centres[self._position]
+        self._pose[:, 2] = MOVE_HEADINGS_RAD[actions]
+        self._speed[:, 0] = ~hit
+        self._last_action[:, 0] = 1.0
+        return Motion(
+            travelled_m=np.where(hit, 0.0, self.layout.cell_size_m),
+            hit=hit,
+            hit_inner_wall=self._table.hit_inner_wall[before, actions],
+            failed=np.zeros(self.num_envs, dtype=bool),
+        )
+
+    def _distances(self, ids: IntArray | slice) -> FloatArray:
+        distances: FloatArray = self._moves_to_goal[self._table_row[self._numbers(self._goal[ids])], self._position[ids]]
+        return distances
+
+    def _arrived(self) -> BoolArray:
+        arrived: BoolArray = self._position == self._numbers(self._goal)
+        return arrived
+
+    def _cell(self) -> IntArray:
+        return np.stack(np.divmod(self._position, self.layout.n_cols), axis=1)
+
+    def _observe(self, ids: IntArray) -> AnyArray:
+        if self.observation == "features":
+            return super()._observe(ids)
+        if self.observation == "cell":
+            return self._position[ids]
+        return self._position[ids] * len(self.goal_cells) + self._goal_rank[self._numbers(self._goal[ids])]
+
+    def render(self) -> tuple[Any, ...] | None:
+        """A picture or text per environment, in the form of ``render_mode``; the window of ``human`` shows the first."""
+        if self.render_mode is None:
+            return None
+        if self.render_mode == "ansi":
+            return tuple(self._text(i) for i in range(self.num_envs))
+        self._painter = self._painter or Painter(fps=self.metadata["render_fps"])
+        if self.render_mode == "human":
+            self._painter.show(self.layout, self._pose[0], self._start[0], self._goal[0], self.layout.cell_size_m * 0.3)
+            return None
+        return tuple(
+            self._painter.picture(self.layout, pose, start, goal, self.layout.cell_size_m * 0.3)
+            for pose, start, goal in zip(self._pose, self._start, self._goal, strict=True)
+        )
+
+    def _text(self, i: int) -> str:
+        """The maze with the robot R and the goal G; the robot at its goal is an asterisk."""
+        grid = np.where(self.layout.walls, "#", ".")
+        cell, goal = tuple(self._cell()[i]), tuple(self._goal[i])
+        grid[goal] = "G"
+        grid[cell] = "*" if cell == goal else "R"
+        return "\n".join("".join(row) for row in grid) + "\n"
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the window."""
+        if self._painter is not None:
+            self._painter.close()
+            self._painter = None
+
+
+class GridWorldEnv(NavigationEnv[GridWorldVectorEnv]):
+    """A robot that moves from cell to cell towards a goal.
+
+    ## Action space
+
+    ``Discrete(4)``: 0 up, 1 down, 2 left, 3 right. A move into a wall or off the edge leaves the robot where it is and
+    counts as a collision. With ``slip`` a move goes to one of its two sides with that probability.
+
+    ## Observation space
+
+    | observation | space |
+    | --- | --- |
+    | ``cell_goal`` (default) | ``Discrete(cells x goals)``: cell * n_goals + goal; cells row by row, goals in the order of ``goal_cells`` |
+    | ``cell`` | ``Discrete(cells)``: the robot's cell alone, which does not say where the goal is |
+    | ``features`` | ``Box``: the feature vector of the robot worlds, with the lidar at the cell's centre |
+
+    ## Reward
+
+    See ``gridnav.Reward``; one move takes one cell-time.
+
+    ## Episode start and end
+
+    The task draws start and goal. ``terminated`` at the goal (and at a collision, where the task says so); ``truncated``
+    after ``max_episode_steps`` (100 with ``gym.make``).
+
+    Args:
+        observation: One of the three above.
+        slip: Probability that a move goes sideways.
+        shared: ``layout``, ``task``, ``reward``, ``render_mode`` and ``max_episode_steps``, see
+            ``NavigationVectorEnv``.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "render_modes": GridWorldVectorEnv.metadata["render_modes"],
+        "render_fps": GridWorldVectorEnv.metadata["render_fps"],
+    }
+
+    def __init__(self, *, observation: ObservationMode = "cell_goal", slip: float = 0.0, **shared: Any) -> None:
+        super().__init__(GridWorldVectorEnv(1, observation=observation, slip=slip, autoreset=False, **shared))
+
+
+def _short(value: Any) -> str:
+    text = repr(value).replace("\n", " ")
+    return text if len(text) <= 60 else text[:57] + "..."

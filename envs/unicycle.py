@@ -1,0 +1,159 @@
+"""Unicycle: a differential drive without inertia, motors or slip."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numba
+import numpy as np
+from gymnasium.vector import AutoresetMode
+
+from gridnav.envs.painter import Painter
+from gridnav.envs.navigation import Motion
+from gridnav.envs.robot_world import RobotEnv, RobotVectorEnv
+from gridnav.problem.geodesic import clearance
+from gridnav.problem.types import AnyArray, BoolArray, FloatArray
+
+SUBSTEP_S = 0.01
+"""Where a wall is near, contact is looked for this often: a robot at full speed moves 2 mm in it."""
+
+
+class UnicycleVectorEnv(RobotVectorEnv):
+    """``num_envs`` kinematic robots, stepped as arrays; see ``UnicycleEnv`` for the page of the environment."""
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "render_modes": ["rgb_array", "human"],
+        "render_fps": 5,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
+    world = "Unicycle"
+
+    def __init__(self, num_envs: int = 1, **shared: Any) -> None:
+        self._painter: Painter | None = None
+        super().__init__(num_envs, **shared)
+
+    def _drive(self, actions: AnyArray) -> Motion:
+        wheels = self.robot.wheel_fractions(actions)
+        forward, turn = wheels.mean(axis=1), (wheels[:, 1] - wheels[:, 0]) / 2
+        travelled, hit = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=bool)
+        inner = np.zeros(self.num_envs, dtype=bool)
+        heading = self._pose[:, 2].copy()
+        _roll(
+            self._pose,
+            forward * self.robot.max_speed_m_s,
+            turn * self.robot.max_turn_rad_s,
+            self.control_period_s,
+            self.robot.radius_m,
+            self.task.on_collision == "slide",
+            self.layout.walls,
+            self.layout.cell_size_m,
+            travelled,
+            hit,
+            inner,
+        )
+        turned = self._pose[:, 2] - heading
+        self._pose[:, 2] = (self._pose[:, 2] + np.pi) % (2 * np.pi) - np.pi
+        self._speed[:, 0] = np.copysign(travelled, forward) / (self.control_period_s * self.robot.max_speed_m_s)
+        self._speed[:, 1] = turned / (self.control_period_s * self.robot.max_turn_rad_s)
+        self._last_action = actions
+        return Motion(travelled, hit, inner, np.zeros(self.num_envs, dtype=bool))
+
+    def render(self) -> tuple[Any, ...] | None:
+        """A picture per environment; the window of ``human`` shows the first."""
+        if self.render_mode is None:
+            return None
+        self._painter = self._painter or Painter(fps=self.metadata["render_fps"])
+        if self.render_mode == "human":
+            self._painter.show(self.layout, self._pose[0], self._start[0], self._goal[0], self.robot.radius_m)
+            return None
+        return tuple(
+            self._painter.picture(self.layout, pose, start, goal, self.robot.radius_m)
+            for pose, start, goal in zip(self._pose, self._start, self._goal, strict=True)
+        )
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the window."""
+        if self._painter is not None:
+            self._painter.close()
+            self._painter = None
+
+
+class UnicycleEnv(RobotEnv[UnicycleVectorEnv]):
+    """A round robot with two wheels that follow their commands at once.
+
+    ## Action space
+
+    ``Box(-1, 1, (2,))``: forward and turning speed as fractions of the robot's maxima (0.197 m/s and 2.46 rad/s). Each
+    wheel is clipped to its own maximum.
+
+    ## Observation space
+
+    ``Box`` of 35 numbers, the feature vector of ``gridnav.envs.observation``: 24 lidar beams, goal distance and bearing,
+    position, heading, speed and last action.
+
+    ## Reward
+
+    See ``gridnav.Reward``; a control period of 0.2 s is 0.079 cell-times.
+
+    ## Episode start and end
+
+    The task draws start, goal and heading; the robot starts at a cell's centre. ``terminated`` within 0.15 m of the
+    goal's centre; a wall stops the robot for the rest of the control period. ``truncated`` after ``max_episode_steps``
+    (500 with ``gym.make``: 100 s).
+
+    Args:
+        shared: ``layout``, ``task``, ``reward``, ``render_mode``, ``control_period_s`` and ``max_episode_steps``, see
+            ``RobotVectorEnv`` and ``NavigationVectorEnv``.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "render_modes": UnicycleVectorEnv.metadata["render_modes"],
+        "render_fps": UnicycleVectorEnv.metadata["render_fps"],
+    }
+
+    def __init__(self, **shared: Any) -> None:
+        super().__init__(UnicycleVectorEnv(1, autoreset=False, **shared))
+
+
+@numba.njit(cache=True)
+def _roll(
+    poses: FloatArray,
+    speeds: FloatArray,
+    turns: FloatArray,
+    period: float,
+    radius: float,
+    slides: bool,
+    walls: BoolArray,
+    cell: float,
+    travelled: FloatArray,
+    hits: BoolArray,
+    inner_hits: BoolArray,
+) -> None:
+    """Constant-twist arcs (Siegwart et al. 2011, section 3.2.3), cut where the bumper meets a wall."""
+    n_substeps = int(np.ceil(period / SUBSTEP_S - 1e-9))
+    for i in range(len(poses)):
+        x, y, heading = poses[i]
+        speed, turn = speeds[i], turns[i]
+        # Far from walls one arc does; near them, short ones that stop at contact.
+        gap, _, _, _ = clearance(x, y, walls, cell)
+        n = 1 if gap - radius > abs(speed) * period else n_substeps
+        dt = period / n
+        for _ in range(n):
+            turned = turn * dt
+            # sin(a)/a of half the angle turned: chord over arc, 1 for a straight line.
+            chord = speed * dt * (np.sin(turned / 2) / (turned / 2) if abs(turned) > 1e-12 else 1.0)
+            way = abs(speed) * dt
+            to_x, to_y = x + chord * np.cos(heading + turned / 2), y + chord * np.sin(heading + turned / 2)
+            gap, ux, uy, inner = clearance(to_x, to_y, walls, cell)
+            if gap < radius and speed != 0.0 and (to_x - x) * ux + (to_y - y) * uy > 0.0:
+                hits[i] = True
+                inner_hits[i] = inner_hits[i] or inner
+                if not slides:
+                    break
+                to_x, to_y = to_x + ux * (gap - radius), to_y + uy * (gap - radius)
+                if clearance(to_x, to_y, walls, cell)[0] < radius - 1e-6:  # pushed into a second wall
+                    to_x, to_y = x, y
+                way = np.hypot(to_x - x, to_y - y)
+            travelled[i] += way
+            x, y, heading = to_x, to_y, heading + turned
+        poses[i, 0], poses[i, 1], poses[i, 2] = x, y, heading
