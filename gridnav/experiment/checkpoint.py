@@ -1,0 +1,116 @@
+"""Crash-safe, pickle-free files of a run.
+
+A checkpoint is a fresh directory: written aside, synced, renamed, then older ones pruned. Whatever instant a run is killed
+at, the newest directory under ``checkpoints/`` whose hashes verify is whole.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import uuid
+from importlib.metadata import version
+from pathlib import Path
+
+from gridnav.agents.base import AGENT_FILE, Agent
+from gridnav.agents.planner import Planner
+from gridnav.agents.q_learning import QLearning
+from gridnav.problem.types import InputError
+
+FORMAT = 1
+KEPT = 2
+"""Checkpoints that pruning leaves."""
+MANIFEST = "manifest.json"
+LIBRARIES = ("gridnav", "numpy", "torch", "mujoco", "gymnasium", "stable-baselines3")
+
+
+def save_agent(agent: Agent, directory: Path, step: int) -> Path:
+    """Write an agent as ``step-000000012345`` into a directory of checkpoints.
+
+    Args:
+        agent: What to save.
+        directory: Made if it does not exist.
+        step: Environment steps the agent has learnt from.
+
+    Returns:
+        The checkpoint's directory.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    aside = directory / f".tmp-{uuid.uuid4().hex}"
+    aside.mkdir()
+    agent.save(aside)
+    parts = {part.name: _digest(part) for part in sorted(aside.iterdir())}
+    manifest = {
+        "format": FORMAT,
+        "kind": agent.kind,
+        "step": step,
+        "versions": {name: version(name) for name in LIBRARIES},
+        "parts": parts,
+    }
+    (aside / MANIFEST).write_text(json.dumps(manifest, indent=2), encoding="utf-8")
+    for part in aside.iterdir():
+        _sync(part)
+    _sync(aside)
+    final = directory / f"step-{step:012d}"
+    if final.exists():
+        shutil.rmtree(final)
+    aside.rename(final)
+    _sync(directory)
+    for old in sorted(directory.glob("step-*"))[:-KEPT]:
+        shutil.rmtree(old)
+    return final
+
+
+def load_agent(directory: Path) -> Agent:
+    """The newest whole checkpoint's agent.
+
+    Args:
+        directory: A directory of checkpoints.
+
+    Raises:
+        InputError: When it holds none that verifies.
+    """
+    for checkpoint in sorted(directory.glob("step-*"), reverse=True):
+        if _is_whole(checkpoint):
+            return _agent_class(json.loads((checkpoint / AGENT_FILE).read_text(encoding="utf-8"))["kind"]).load(checkpoint)
+    raise InputError(f"{str(directory)!r} holds no whole checkpoint of an agent")
+
+
+def _agent_class(kind: str) -> type[Agent]:
+    if kind == "ppo":
+        from gridnav.agents.ppo import PPOAgent  # torch takes seconds to import
+
+        return PPOAgent
+    for known in (Planner, QLearning):
+        if known.kind == kind:
+            return known
+    raise InputError(f"the checkpoint holds an agent of the unknown kind {kind!r}")
+
+
+def _is_whole(checkpoint: Path) -> bool:
+    try:
+        manifest = json.loads((checkpoint / MANIFEST).read_text(encoding="utf-8"))
+        parts: dict[str, dict[str, object]] = manifest["parts"]
+        # Names come from a file: only plain ones inside the checkpoint are looked at.
+        plain = all(name == Path(name).name for name in parts)
+        return manifest["format"] == FORMAT and plain and all(_digest(checkpoint / n) == d for n, d in parts.items())
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return False
+
+
+def _digest(part: Path) -> dict[str, object]:
+    content = part.read_bytes()
+    return {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+
+
+def _sync(path: Path) -> None:
+    """Force a file or directory to the disk, where the system lets a directory be opened."""
+    if os.name == "nt" and path.is_dir():
+        return
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
