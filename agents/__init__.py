@@ -1,10 +1,32 @@
-"""The learners: value iteration, tabular Q-learning, PPO.
+"""The learners: value iteration, tabular Q-learning, PPO."""
 
-Only the tabular agents are imported here: PPO brings torch, which takes seconds; import it from ``gridnav.agents.ppo``.
-"""
+from typing import TYPE_CHECKING, Any
 
-from gridnav.agents.base import Agent, Progress
-from gridnav.agents.planner import Planner
-from gridnav.agents.q_learning import QLearning, QLearningConfig
+from .base import Agent, OnProgress, Progress
+from .planner import Planner
+from .q_learning import QLearning, QLearningConfig
+from .tabular import TabularAgent
 
-__all__ = ["Agent", "Planner", "Progress", "QLearning", "QLearningConfig"]
+if TYPE_CHECKING:
+    from .ppo import PPOAgent, PPOConfig
+
+__all__ = [
+    "Agent",
+    "OnProgress",
+    "PPOAgent",
+    "PPOConfig",
+    "Planner",
+    "Progress",
+    "QLearning",
+    "QLearningConfig",
+    "TabularAgent",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """PPO on first use: it brings torch, which takes seconds to import."""
+    if name in ("PPOAgent", "PPOConfig"):
+        from . import ppo
+
+        return getattr(ppo, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

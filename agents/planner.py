@@ -7,8 +7,8 @@ from typing import Any, Self
 import numpy as np
 from gymnasium.vector import VectorEnv
 
-from gridnav.agents.base import OnProgress
-from gridnav.agents.tabular import TabularAgent
+from .base import OnProgress
+from .tabular import TabularAgent
 from gridnav.problem.grid_mdp import GridMDP
 from gridnav.problem.layout import Layout
 from gridnav.problem.reward import Reward

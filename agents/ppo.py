@@ -22,7 +22,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv
 
-from gridnav.agents.base import Agent, EpisodeWindow, OnProgress, Progress
+from .base import Agent, EpisodeWindow, OnProgress, Progress
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from gymnasium.spaces import Discrete
 from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
-from gridnav.agents.base import EpisodeWindow, OnProgress, Progress
-from gridnav.agents.tabular import TabularAgent
+from .base import EpisodeWindow, OnProgress, Progress
+from .tabular import TabularAgent
 
 REPORTS = 50
 """Progress reports per training."""

@@ -7,7 +7,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from gridnav.agents.base import Agent
+from .base import Agent
 from gridnav.problem.types import FloatArray
 
 

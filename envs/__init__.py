@@ -2,11 +2,14 @@
 
 import gymnasium as gym
 
-from gridnav.envs.diff_drive import DiffDriveEnv, DiffDriveVectorEnv
-from gridnav.envs.grid_moves import GridMoves
-from gridnav.envs.grid_world import GridWorldEnv, GridWorldVectorEnv
-from gridnav.envs.observation import FeatureVector
-from gridnav.envs.unicycle import UnicycleEnv, UnicycleVectorEnv
+from .diff_drive import DiffDriveEnv, DiffDriveVectorEnv
+from .gl import RenderingError
+from .grid_moves import GridMoves, MoveDriver
+from .grid_world import GridWorldEnv, GridWorldVectorEnv
+from .lidar import scan
+from .navigation import NavigationEnv, NavigationVectorEnv
+from .observation import FeatureVector
+from .unicycle import UnicycleEnv, UnicycleVectorEnv
 
 __all__ = [
     "DiffDriveEnv",
@@ -15,8 +18,13 @@ __all__ = [
     "GridMoves",
     "GridWorldEnv",
     "GridWorldVectorEnv",
+    "MoveDriver",
+    "NavigationEnv",
+    "NavigationVectorEnv",
+    "RenderingError",
     "UnicycleEnv",
     "UnicycleVectorEnv",
+    "scan",
 ]
 
 MAX_EPISODE_STEPS = {"GridWorld": 100, "Unicycle": 500, "DiffDrive": 500}

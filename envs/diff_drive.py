@@ -9,10 +9,10 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from mujoco.batch import Batch
 
-from gridnav.envs import gl
-from gridnav.envs.mjcf import build_model
-from gridnav.envs.navigation import Motion
-from gridnav.envs.robot_world import RobotEnv, RobotVectorEnv, towards
+from . import gl
+from .mjcf import build_model
+from .navigation import Motion
+from .robot_world import RobotEnv, RobotVectorEnv, towards
 from gridnav.problem.geodesic import clearances
 from gridnav.problem.types import AnyArray, BoolArray, FloatArray, InputError, IntArray
 

@@ -9,8 +9,8 @@ import numpy as np
 from gymnasium.spaces import Discrete
 from gymnasium.vector import AutoresetMode
 
-from gridnav.envs.navigation import Motion, NavigationEnv, NavigationVectorEnv
-from gridnav.envs.painter import Painter
+from .navigation import Motion, NavigationEnv, NavigationVectorEnv
+from .painter import Painter
 from gridnav.problem.geodesic import cell_distances
 from gridnav.problem.grid_mdp import MOVE_HEADINGS_RAD, SIDEWAYS, MoveTable
 from gridnav.problem.types import AnyArray, BoolArray, FloatArray, InputError, IntArray

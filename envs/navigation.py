@@ -17,8 +17,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from gridnav.envs.lidar import scan
-from gridnav.envs.observation import FeatureVector
+from .lidar import scan
+from .observation import FeatureVector
 from gridnav.problem.layout import Layout
 from gridnav.problem.reward import TERM_NAMES, Reward, Transition, total
 from gridnav.problem.robot import BURGER, Robot
@@ -226,6 +226,11 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
     def step_gamma(self) -> float:
         """Discount of one step that matches the reward's discount per cell-time."""
         return float(self.reward.gamma**self.step_duration)
+
+    def start_and_goal(self, i: int) -> tuple[Cell, Cell]:
+        """Start and goal cell of environment ``i``'s current episode."""
+        (row, col), (goal_row, goal_col) = self._start[i].tolist(), self._goal[i].tolist()
+        return (row, col), (goal_row, goal_col)
 
     @property
     def goal_cells(self) -> IntArray:

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 
-from gridnav.envs.navigation import NavigationEnv, NavigationVectorEnv, VectorWorld
+from .navigation import NavigationEnv, NavigationVectorEnv, VectorWorld
 from gridnav.problem.geodesic import Geodesic
 from gridnav.problem.types import AnyArray, BoolArray, FloatArray, InputError, IntArray
 

@@ -8,9 +8,9 @@ import numba
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from gridnav.envs.painter import Painter
-from gridnav.envs.navigation import Motion
-from gridnav.envs.robot_world import RobotEnv, RobotVectorEnv
+from .painter import Painter
+from .navigation import Motion
+from .robot_world import RobotEnv, RobotVectorEnv
 from gridnav.problem.geodesic import clearance
 from gridnav.problem.types import AnyArray, BoolArray, FloatArray
 

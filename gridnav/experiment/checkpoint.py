@@ -13,10 +13,9 @@ import shutil
 import uuid
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
-from gridnav.agents.base import AGENT_FILE, Agent
-from gridnav.agents.planner import Planner
-from gridnav.agents.q_learning import QLearning
+from gridnav.agents import Agent, Planner, QLearning
 from gridnav.problem.types import InputError
 
 FORMAT = 1
@@ -26,13 +25,14 @@ MANIFEST = "manifest.json"
 LIBRARIES = ("gridnav", "numpy", "torch", "mujoco", "gymnasium", "stable-baselines3")
 
 
-def save_agent(agent: Agent, directory: Path, step: int) -> Path:
+def save_agent(agent: Agent, directory: Path, step: int, *, name: str) -> Path:
     """Write an agent as ``step-000000012345`` into a directory of checkpoints.
 
     Args:
         agent: What to save.
         directory: Made if it does not exist.
-        step: Environment steps the agent has learnt from.
+        step: Environment steps the run has taken so far; its agents never share one.
+        name: Which of the run's agents it is; older checkpoints of the same name are pruned.
 
     Returns:
         The checkpoint's directory.
@@ -44,6 +44,7 @@ def save_agent(agent: Agent, directory: Path, step: int) -> Path:
     parts = {part.name: _digest(part) for part in sorted(aside.iterdir())}
     manifest = {
         "format": FORMAT,
+        "name": name,
         "kind": agent.kind,
         "step": step,
         "versions": {name: version(name) for name in LIBRARIES},
@@ -58,29 +59,40 @@ def save_agent(agent: Agent, directory: Path, step: int) -> Path:
         shutil.rmtree(final)
     aside.rename(final)
     _sync(directory)
-    for old in sorted(directory.glob("step-*"))[:-KEPT]:
+    for old in _checkpoints(directory, name)[KEPT:]:
         shutil.rmtree(old)
     return final
 
 
-def load_agent(directory: Path) -> Agent:
-    """The newest whole checkpoint's agent.
+def load_agent(directory: Path, name: str) -> Agent:
+    """An agent of a run, from its newest whole checkpoint.
 
     Args:
         directory: A directory of checkpoints.
+        name: Which of the run's agents.
 
     Raises:
         InputError: When it holds none that verifies.
     """
-    for checkpoint in sorted(directory.glob("step-*"), reverse=True):
-        if _is_whole(checkpoint):
-            return _agent_class(json.loads((checkpoint / AGENT_FILE).read_text(encoding="utf-8"))["kind"]).load(checkpoint)
-    raise InputError(f"{str(directory)!r} holds no whole checkpoint of an agent")
+    for checkpoint in _checkpoints(directory, name):
+        return _agent_class(_manifest(checkpoint)["kind"]).load(checkpoint)
+    raise InputError(f"{str(directory)!r} holds no whole checkpoint of {name!r}")
+
+
+def _checkpoints(directory: Path, name: str) -> list[Path]:
+    """Whole checkpoints of one agent, newest first."""
+    newest_first = sorted(directory.glob("step-*"), reverse=True)
+    return [path for path in newest_first if _is_whole(path) and _manifest(path)["name"] == name]
+
+
+def _manifest(checkpoint: Path) -> dict[str, Any]:
+    manifest: dict[str, Any] = json.loads((checkpoint / MANIFEST).read_text(encoding="utf-8"))
+    return manifest
 
 
 def _agent_class(kind: str) -> type[Agent]:
     if kind == "ppo":
-        from gridnav.agents.ppo import PPOAgent  # torch takes seconds to import
+        from gridnav.agents import PPOAgent  # torch takes seconds to import
 
         return PPOAgent
     for known in (Planner, QLearning):
@@ -91,7 +103,7 @@ def _agent_class(kind: str) -> type[Agent]:
 
 def _is_whole(checkpoint: Path) -> bool:
     try:
-        manifest = json.loads((checkpoint / MANIFEST).read_text(encoding="utf-8"))
+        manifest = _manifest(checkpoint)
         parts: dict[str, dict[str, object]] = manifest["parts"]
         # Names come from a file: only plain ones inside the checkpoint are looked at.
         plain = all(name == Path(name).name for name in parts)

@@ -9,11 +9,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-import gridnav.envs  # registers the environments
-from gridnav.agents.base import Agent
-from gridnav.envs.grid_moves import MoveDriver
-from gridnav.envs.lidar import scan
-from gridnav.envs.navigation import NavigationVectorEnv
+from gridnav.agents import Agent, OnProgress, Progress
+from gridnav.envs import MoveDriver, NavigationVectorEnv, scan
 from gridnav.problem.metrics import Episode, Trace
 from gridnav.problem.types import AnyArray
 
@@ -62,13 +59,20 @@ def drive_by_moves(agent: Agent, worlds: NavigationVectorEnv) -> Policy:
     return act
 
 
-def evaluate(policy: Policy, worlds: NavigationVectorEnv, *, seed: int = EVALUATION_SEED) -> list[Episode]:
+def evaluate(
+    policy: Policy,
+    worlds: NavigationVectorEnv,
+    *,
+    seed: int = EVALUATION_SEED,
+    on_progress: OnProgress | None = None,
+) -> list[Episode]:
     """The first episode of every environment under a policy.
 
     Args:
         policy: Chooses the actions.
         worlds: As many environments as episodes are wanted. They need a time limit.
         seed: Gives every environment its start, goal and heading, the same in every world.
+        on_progress: Told how many episodes have ended; its steps are episodes.
 
     Returns:
         One record per environment, with its trace.
@@ -88,6 +92,10 @@ def evaluate(policy: Policy, worlds: NavigationVectorEnv, *, seed: int = EVALUAT
         for i in np.flatnonzero((terminated | truncated) & running):
             last[i] = {key: value[i] for key, value in info["final_info"].items() if isinstance(value, np.ndarray)}
             running[i] = False
+        if on_progress and "final_info" in info:
+            ended = n - int(running.sum())
+            arrived = sum(bool(one["is_success"]) for one in last if one)
+            on_progress(Progress(ended, n, {"success_rate": arrived / max(ended, 1)}))
     return [course.episode(i, last[i]) for i in range(n)]
 
 

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gridnav.problem.geodesic import cell_distances
 from gridnav.problem.grid_mdp import GridMDP
 from gridnav.problem.layout import Layout
-from gridnav.problem.reward import Reward
+from gridnav.problem.reward import Reward, Transition, total
 from gridnav.problem.task import Task
 from gridnav.problem.types import Cell, InputError
 
@@ -88,6 +89,41 @@ def lint_grid(reward: Reward, layout: Layout, task: Task, *, gamma: float | None
     if worst is None:
         raise InputError("this layout leaves no way to avoid the goal, so there is nothing to compare")
     return worst[1]
+
+
+def lint_idling(reward: Reward, layout: Layout, task: Task) -> Finding:
+    """Whether standing still earns anything, at the cell where it earns most.
+
+    A learner that sees a fraction of the way ahead settles for what pays at once, so idling must cost at every distance,
+    also where the goal would pay more.
+
+    Returns:
+        The cell and goal where idling forever does best; sane when it costs there.
+    """
+    best: Finding | None = None
+    for goal in map(tuple, task.goal_cells(layout).tolist()):
+        cells = np.argwhere(layout.reachable)
+        distance = cell_distances(layout, goal)[tuple(cells.T)]
+        n, nothing = len(cells), np.zeros(len(cells), dtype=bool)
+        step = Transition(
+            travelled=np.zeros(n),
+            duration=np.ones(n),
+            distance=distance,
+            next_distance=distance,
+            manhattan=np.abs(cells - goal).sum(axis=1).astype(np.float64),
+            at_goal=nothing,
+            hit=nothing,
+            hit_inner_wall=nothing,
+            terminal=nothing,
+            time_up=nothing,
+        )
+        earned = np.where(distance > 0, total(reward.terms(step)), -np.inf)
+        i = int(earned.argmax())
+        if best is None or earned[i] > best.avoiding_return:
+            cell = (int(cells[i][0]), int(cells[i][1]))
+            best = Finding("all worlds", "standing still for one cell-time", cell, goal, float(earned[i]), 0.0)
+    assert best is not None, "a layout has at least one goal"
+    return best
 
 
 def _loop(mdp: GridMDP, policy: np.ndarray, start: int, n_cols: int) -> str:

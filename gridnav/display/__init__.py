@@ -1,0 +1,1 @@
+"""Pictures: recordings for Rerun, figures, and the report of a run."""

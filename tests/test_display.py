@@ -1,0 +1,443 @@
+"""Recordings are read back, figures are asked what they drew, and the report is parsed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+import rerun as rr
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.quiver import Quiver
+from rerun.chunk import RrdReader
+
+from gridnav.display import palette
+from gridnav.display.figures import learning_curves, moving_average, save_figure, svg_text, trajectories, value_map
+from gridnav.display.recording import ViewerError, open_viewer, screenshot, write_recording
+from gridnav.display.report import Picture, Report, Rung, write_report
+from gridnav.problem.layout import Layout
+from gridnav.problem.metrics import Episode, Trace, summarise
+from gridnav.problem.robot import BURGER
+
+CORRIDOR = Layout.from_text("S...G\n.###.\n.....\n")
+
+
+@pytest.fixture(autouse=True)
+def _strict_rerun() -> Iterator[None]:
+    """Otherwise a failed log call is a warning and its data is missing."""
+    rr.set_strict_mode(True)
+    yield
+    rr.set_strict_mode(False)
+
+
+def drive(*, steps: int = 10, is_success: bool = True, hits: tuple[int, ...] = (), grid: bool = False) -> Episode:
+    """An episode from (0, 0) to (0, 4) of the corridor at constant speed, with its trace; 2 m in all."""
+    x = np.linspace(0.25, 2.25 if is_success else 1.25, steps + 1)
+    poses = np.column_stack([x, np.full(steps + 1, 1.25), np.full(steps + 1, np.pi / 6)])
+    scans = np.full((steps + 1, 24), 1.0)
+    scans[:, 6:] = BURGER.lidar_range_m  # eighteen beams meet nothing
+    hit = np.isin(np.arange(steps), hits).astype(np.int64)
+    terms = {"goal": np.r_[np.zeros(steps - 1), 10.0 * is_success], "time": np.full(steps, -0.25)}
+    actions = np.full((steps, 1), 3.0) if grid else np.tile([1.0, -0.5], (steps, 1))
+    trace = Trace(np.arange(steps + 1) * 0.2, poses, scans, actions, terms, hit)
+    return Episode(
+        (0, 0), (0, 4), is_success, len(hits), float(x[-1] - x[0]), 2.0, steps * 0.2, 10.0, steps,
+        float(sum(term.sum() for term in terms.values())), trace=trace,
+    )  # fmt: skip
+
+
+def columns(path: Path, entity: str, column: str) -> list[object]:
+    """One column of an entity, one element per row, from the static or the timed data that has it."""
+    for chunk in RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        if chunk.entity_path == entity and column in batch.schema.names:
+            return list(batch.column(column).to_pylist())
+    raise AssertionError(f"{entity} has no {column}")
+
+
+def entities(path: Path) -> set[str]:
+    return {chunk.entity_path for chunk in RrdReader(path).stream()}
+
+
+# ---- Recordings --------------------------------------------------------------------------------
+
+
+def test_rollouts_stand_side_by_side_on_one_timeline(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+
+    write_recording(path, CORRIDOR, {"grid": drive(steps=4, grid=True), "robot": drive(steps=10)})
+
+    for name, steps in (("grid", 4), ("robot", 10)):
+        assert columns(path, f"/rollouts/{name}/robot", "step") == list(range(steps + 1))
+        seconds = [time.total_seconds() for time in columns(path, f"/rollouts/{name}/robot", "sim_time")]
+        np.testing.assert_allclose(seconds, 0.2 * np.arange(steps + 1))
+    here = entities(path)
+    assert "/rollouts/robot/robot/lidar/rays" in here
+    assert "/rollouts/grid/robot/lidar/rays" not in here, "a grid robot has no lidar to draw"
+
+
+def test_the_robot_stands_and_looks_where_its_trace_says(tmp_path: Path) -> None:
+    path, episode = tmp_path / "run.rrd", drive(steps=3)
+    assert episode.trace is not None
+
+    write_recording(path, CORRIDOR, {"robot": episode})
+
+    places = np.array(columns(path, "/rollouts/robot/robot", "Transform3D:translation"))[:, 0]
+    np.testing.assert_allclose(places[:, :2], episode.trace.poses[:, :2], rtol=1e-6)
+    turns = np.array(columns(path, "/rollouts/robot/robot", "Transform3D:quaternion"))[:, 0]
+    # By hand: 30 degrees about z is (0, 0, sin 15, cos 15) in the order x, y, z, w.
+    np.testing.assert_allclose(turns, np.tile([0, 0, 0.2588190, 0.9659258], (4, 1)), atol=1e-6)
+
+
+def test_rays_are_as_long_as_the_scan_and_only_measured_walls_have_points(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+
+    write_recording(path, CORRIDOR, {"robot": drive(steps=3)})
+
+    rays = np.array(columns(path, "/rollouts/robot/robot/lidar/rays", "LineStrips3D:strips"))
+    assert rays.shape == (4, 24, 2, 3)
+    lengths = np.linalg.norm(rays[:, :, 1] - rays[:, :, 0], axis=-1)
+    np.testing.assert_allclose(lengths[0], [1.0] * 6 + [3.5] * 18, rtol=1e-6)
+    points = np.array(columns(path, "/rollouts/robot/robot/lidar/hits", "Points3D:positions"))
+    assert points.shape == (4, 6, 3)
+    np.testing.assert_allclose(points[0, 0], [1, 0, 0])  # the first beam looks ahead, in the lidar's frame
+    assert points[0, 1, 1] > 0, "beams go counter-clockwise"
+    mount = columns(path, "/rollouts/robot/robot/lidar", "Transform3D:translation")
+    np.testing.assert_allclose(mount, [[[-0.032, 0.0, 0.182]]], rtol=1e-6)
+
+
+def test_reward_curves_end_at_the_return(tmp_path: Path) -> None:
+    path, episode = tmp_path / "run.rrd", drive(steps=4)
+
+    write_recording(path, CORRIDOR, {"robot": episode})
+
+    assert columns(path, "/return/robot", "SeriesLines:names") == [["goal", "time"]]
+    sums = np.array(columns(path, "/return/robot", "Scalars:scalars"))
+    np.testing.assert_allclose(sums, [[0, -0.25], [0, -0.5], [0, -0.75], [10, -1.0]])
+    assert sums[-1].sum() == episode.episode_return
+    assert columns(path, "/return/robot", "step") == [1, 2, 3, 4], "a reward stands at the end of its step"
+    assert columns(path, "/action/robot", "step") == [0, 1, 2, 3], "an action stands at the beginning of its step"
+
+
+def test_the_distance_curve_is_the_free_way_to_the_goal(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+
+    write_recording(path, CORRIDOR, {"robot": drive(steps=4)})
+
+    # By hand: from (0.25, 1.25) straight to (2.25, 1.25) in four steps of half a metre.
+    distances = columns(path, "/distance_to_goal/robot", "Scalars:scalars")
+    np.testing.assert_allclose(distances, [[2.0], [1.5], [1.0], [0.5], [0.0]], atol=1e-6)
+
+
+def test_collisions_are_marked_and_turn_the_robot_red(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+
+    write_recording(path, CORRIDOR, {"robot": drive(steps=4, hits=(1,))})
+
+    (marks,) = columns(path, "/rollouts/robot/collisions", "Points3D:positions")
+    np.testing.assert_allclose(np.array(marks)[:, :2], [[1.25, 1.25]])  # where the second step ended
+    colours = np.array(columns(path, "/rollouts/robot/robot/body", "Cylinders3D:colors"))[:, 0]
+    red = int(palette.COLLISION[1:] + "ff", 16)
+    np.testing.assert_array_equal(colours == red, [False, False, True, False, False])
+
+
+def test_the_run_card_says_what_was_reached_and_with_which_seeds(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    rollouts = {"from | scratch": drive(is_success=False), "warm": drive()}
+
+    write_recording(path, CORRIDOR, rollouts, title="Two agents", properties={"seed": 7})
+
+    ((card,),) = columns(path, "/run_card", "TextDocument:text")
+    assert "# Two agents" in card
+    assert "| from / scratch | **missed** | 1.00 | 2.00 |" in card
+    assert "| warm | reached | 2.00 | 2.00 | 2.0 | 0 | 7.50 |" in card
+    assert "- seed: 7" in card
+    assert columns(path, "/__properties/run", "seed") == [["7"]]
+
+
+def test_a_recording_is_written_in_columns_and_not_step_by_step(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+
+    write_recording(path, CORRIDOR, {"robot": drive(steps=500)})
+
+    chunks = [chunk for chunk in RrdReader(path).stream() if not chunk.is_static]
+    assert len(chunks) == len({chunk.entity_path for chunk in chunks}), "one chunk per moving entity"
+
+
+def test_a_name_with_slashes_and_spaces_stays_one_entity(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+
+    write_recording(path, CORRIDOR, {"PPO / warm: 2": drive()})
+
+    assert r"/distance_to_goal/PPO\ \/\ warm\:\ 2" in entities(path)
+
+
+def test_rollouts_without_a_trace_or_with_other_goals_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="each with a trace"):
+        write_recording(tmp_path / "run.rrd", CORRIDOR, {"robot": replace(drive(), trace=None)})
+    with pytest.raises(ValueError, match="share one start and goal"):
+        write_recording(tmp_path / "run.rrd", CORRIDOR, {"a": drive(), "b": replace(drive(), goal=(2, 4))})
+
+
+def test_a_picture_is_made_without_a_display(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    recording, picture = tmp_path / "run.rrd", tmp_path / "run.png"
+    write_recording(recording, CORRIDOR, {"robot": drive()})
+
+    try:
+        screenshot(recording, picture, time_s=1.0, window_size=(800, 600))
+    except ViewerError as error:
+        if "Vulkan" in str(error):
+            pytest.skip("no Vulkan driver here (Debian package mesa-vulkan-drivers)")
+        raise
+
+    pixels = matplotlib.image.imread(picture)[..., :3]
+    assert pixels.shape == (600, 800, 3)
+    for colour in (palette.GOAL, palette.FAST, palette.SLOW):
+        near = np.abs(pixels - to_rgb(colour)).max(axis=-1) < 0.1
+        assert near.sum() > 20, f"nothing of colour {colour} is in sight"
+
+
+def test_without_a_graphics_driver_the_error_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_recording(tmp_path / "run.rrd", CORRIDOR, {"robot": drive()})
+    for variable in ("VK_DRIVER_FILES", "VK_ICD_FILENAMES"):
+        monkeypatch.setenv(variable, str(tmp_path / "none.json"))
+
+    with pytest.raises(ViewerError, match="mesa-vulkan-drivers") as caught:
+        screenshot(tmp_path / "run.rrd", tmp_path / "run.png")
+
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.skipif("sys.platform != 'linux'", reason="elsewhere there is always a display")
+def test_without_a_display_the_viewer_names_the_alternatives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    write_recording(tmp_path / "run.rrd", CORRIDOR, {"robot": drive()})
+
+    with pytest.raises(ViewerError, match=r"gridnav view RUN --screenshot out\.png.*rerun run\.rrd"):
+        open_viewer(tmp_path / "run.rrd")
+    with pytest.raises(ViewerError, match="there is no recording"):
+        open_viewer(tmp_path / "other.rrd")
+
+
+# ---- Figures -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("move", "direction"), [(0, (0, 1)), (1, (0, -1)), (2, (-1, 0)), (3, (1, 0))])
+def test_arrows_point_where_the_move_leads(move: int, direction: tuple[int, int]) -> None:
+    """Up is +y although it goes to a smaller row."""
+    values = np.zeros((15, 4))
+    values[7, move] = 1.0  # the middle of the second row... which is a wall, so no arrow
+    values[10, move] = 1.0  # row 2, column 0
+
+    figure = value_map(CORRIDOR, values, (0, 4))
+
+    (arrows,) = [item for item in figure.axes[0].collections if isinstance(item, Quiver)]
+    assert arrows.N == 1, "walls and cells without a preference carry no arrow"
+    np.testing.assert_allclose([arrows.X[0], arrows.Y[0]], [0.25, 0.25])
+    np.testing.assert_allclose(np.sign([arrows.U[0], arrows.V[0]]), direction)
+
+
+def test_the_value_map_shows_the_best_value_of_each_cell_with_row_0_on_top() -> None:
+    values = np.arange(60.0).reshape(15, 4)
+
+    axes = value_map(CORRIDOR, values, (0, 4)).axes[0]
+
+    (image,) = axes.images
+    shown = image.get_array()
+    assert image.get_extent() == [0, 2.5, 0, 1.5]
+    assert image.origin == "upper"
+    assert shown[0, 0] == 3.0
+    assert shown[2, 4] == 59.0
+    assert shown.mask[1].tolist() == [False, True, True, True, False]
+    assert shown.mask[0, 4], "nothing is earned after the goal"
+
+
+def test_trajectories_tell_success_from_failure_without_colour() -> None:
+    figure = trajectories(CORRIDOR, {"A": [drive(), drive(is_success=False, hits=(2, 3))], "B": [drive()]})
+
+    first, second = figure.axes
+    ways = [line for line in first.lines if line.get_gid() == "way"]
+    assert [line.get_linestyle() for line in ways] == ["-", "--"]
+    np.testing.assert_allclose(np.array(ways[0].get_data())[:, [0, -1]], [[0.25, 2.25], [1.25, 1.25]])
+    assert [line.get_marker() for line in first.lines].count("X") == 1
+    (collisions,) = [line for line in first.lines if line.get_gid() == "collisions"]
+    np.testing.assert_allclose(collisions.get_xdata(), [0.55, 0.65])  # by hand: 0.25 m + three and four tenths
+    assert first.get_title() == "A\n1 of 2 reached the goal"
+    assert (first.get_xlabel(), first.get_ylabel()) == ("x (m)", "y (m)")
+    assert first.get_ylim() == (0, 1.5)
+    assert len([line for line in second.lines if line.get_gid() == "way"]) == 1
+
+
+def test_the_moving_average_looks_back_and_never_ahead() -> None:
+    # By hand: 1, (1+2)/2, (2+3)/2, (3+8)/2.
+    np.testing.assert_allclose(moving_average(np.array([1.0, 2.0, 3.0, 8.0]), 2), [1.0, 1.5, 2.5, 5.5])
+
+
+def test_learning_curves_mark_the_target_and_keep_the_legend_off_the_data() -> None:
+    steps = np.arange(1, 21) * 1000
+    figure = learning_curves({"scratch": (steps, steps / 20000), "warm": (steps, np.ones(20))}, window=5)
+
+    axes = figure.axes[0]
+    (target,) = [line for line in axes.lines if line.get_gid() == "target"]
+    assert list(target.get_ydata()) == [0.95, 0.95]
+    averages = {line.get_label(): line for line in axes.lines}
+    np.testing.assert_allclose(averages["scratch"].get_ydata()[-1], 0.9)  # by hand: mean of 0.80, 0.85 ... 1.00
+    assert averages["scratch"].get_linestyle() != averages["warm"].get_linestyle()
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    assert not legend.get_window_extent().overlaps(axes.get_window_extent())
+
+
+def test_figures_are_saved_by_suffix_and_names_are_no_formulas(tmp_path: Path) -> None:
+    figure = trajectories(CORRIDOR, {r"a $\frac{$ & <b>": [drive()]})
+
+    save_figure(figure, tmp_path / "a.png")
+    save_figure(figure, tmp_path / "a.svg")
+
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+    assert "<svg" in (tmp_path / "a.svg").read_text()
+    assert svg_text(figure).startswith("<svg")
+
+
+def test_equal_figures_give_equal_svg() -> None:
+    def figure() -> Figure:
+        return value_map(CORRIDOR, np.arange(60.0).reshape(15, 4), (0, 4))
+
+    assert svg_text(figure()) == svg_text(figure())
+
+
+# ---- The report --------------------------------------------------------------------------------
+
+
+class _Page(HTMLParser):
+    """Tags, ids, links and the text of table cells."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.ids: list[str] = []
+        self.links: list[str] = []
+        self.rows: list[list[str]] = []
+        self._in_cell = False
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        for name, value in attrs:
+            if name == "id":
+                self.ids.append(value or "")
+            if name in ("href", "src", "xlink:href"):
+                self.links.append(value or "")
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self._in_cell = True
+            self.rows[-1].append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag in ("td", "th"):
+            self._in_cell = False
+
+    def handle_data(self, data: str) -> None:
+        if self._in_cell:
+            self.rows[-1][-1] = " ".join(f"{self.rows[-1][-1]} {data}".split())
+
+
+def ladder_report(*, hostile: str = "") -> Report:
+    rungs = [
+        Rung(
+            "robot" + hostile, "gridnav/DiffDrive-v0" + hostile, "PPO", "the table" + hostile,
+            summarise([drive(), drive(), drive(is_success=False, hits=(1,)), drive()]), 1234567, 754.0,
+            note="no noise" + hostile, seeds="0-2",
+        ),
+        Rung("stuck", "gridnav/Unicycle-v0", "DQN", "", summarise([drive(is_success=False)]), 0, 12.34),
+    ]  # fmt: skip
+    pictures = [
+        Picture(trajectories(CORRIDOR, {"robot" + hostile: [drive()]}), "The way" + hostile),
+        Picture(trajectories(CORRIDOR, {"robot" + hostile: [drive()]}), "The way again"),
+    ]
+    return Report(
+        "Ladder" + hostile, "Does it help?" + hostile, "It does." + hostile, rungs, pictures,
+        {"seed": 3, "name": "x" + hostile}, "gridnav ladder --seed 3" + hostile, {"mujoco": "4.0.0" + hostile},
+        "runs/a" + hostile,
+    )  # fmt: skip
+
+
+def page(tmp_path: Path, report: Report) -> tuple[str, _Page]:
+    write_report(tmp_path / "report.html", report)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    return text, _Page(text)
+
+
+def test_the_table_holds_the_numbers_of_each_rung(tmp_path: Path) -> None:
+    text, parsed = page(tmp_path, ladder_report())
+
+    _head, robot, stuck = parsed.rows
+    assert robot == [
+        "robot PPO in gridnav/DiffDrive-v0 no noise",
+        "the table",
+        "75 % 30 % to 95 %",  # Wilson's interval of 3 in 4: 0.301 to 0.954
+        "0.75",  # every success took the shortest way
+        "0.75",
+        "25 %",
+        "2.0 s",
+        "1 234 567 13 min",
+        "4 0-2",
+    ]
+    assert stuck[1] == "nothing"
+    assert stuck[6] == "never"
+    assert stuck[7] == "0 12.3 s"
+    assert text.index("Does it help?") < text.index("It does.") < text.index("<table")
+    assert "gridnav view runs/a" in text
+    assert "&#34;seed&#34;: 3" in text
+    assert parsed.tags.count("svg") == 2
+
+
+def test_hostile_text_is_shown_and_not_obeyed(tmp_path: Path) -> None:
+    hostile = "<script>alert(1)</script>\"'><img src=x onerror=alert(1)>--></style></svg>"
+
+    text, parsed = page(tmp_path, ladder_report(hostile=hostile))
+
+    assert "script" not in parsed.tags
+    assert "img" not in parsed.tags
+    assert parsed.tags.count("style") == 1 + 2  # the page's own, and one in each figure
+    assert "&lt;script&gt;" in text
+
+
+def test_the_page_asks_no_other_site_for_anything(tmp_path: Path) -> None:
+    text, parsed = page(tmp_path, ladder_report())
+
+    outside = [link for link in parsed.links if not link.startswith(("#", "data:")) and link != "rollout.rrd"]
+    assert outside == []
+    assert not re.search(r"url\((?!#)|@import", text)
+    addresses = set(re.findall(r"https?://[^\s\"'<>]+", text))
+    assert addresses <= {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}, "names, not addresses"
+
+
+def test_no_two_elements_of_the_page_share_an_id(tmp_path: Path) -> None:
+    """Two figures on one page would otherwise clip each other."""
+    text, parsed = page(tmp_path, ladder_report())
+
+    assert len(parsed.ids) == len(set(parsed.ids))
+    used = set(re.findall(r"url\(#([^)]+)\)", text)) | {link[1:] for link in parsed.links if link.startswith("#")}
+    assert used <= set(parsed.ids)
+
+
+def test_a_report_without_pictures_and_details_is_a_page_too(tmp_path: Path) -> None:
+    text, parsed = page(
+        tmp_path, replace(ladder_report(), pictures=(), config={}, command="", versions={}, recording="")
+    )
+
+    assert "What it looks like" not in text
+    assert "details" not in parsed.tags
+    assert "rollout.rrd" not in text
