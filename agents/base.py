@@ -103,7 +103,7 @@ class EpisodeWindow:
 
     @property
     def metrics(self) -> dict[str, float]:
-        """``success_rate``, ``collision_rate`` and the number of ``episodes`` so far; rates are NaN before the first."""
+        """``success_rate``, ``collision_rate`` and the ``episodes`` so far; rates are NaN before the first."""
         if not self._successes:
             return {"success_rate": float("nan"), "collision_rate": float("nan"), "episodes": 0.0}
         return {

@@ -7,12 +7,13 @@ from typing import Any, Self
 import numpy as np
 from gymnasium.vector import VectorEnv
 
-from .base import OnProgress
-from .tabular import TabularAgent
 from gridnav.problem.grid_mdp import GridMDP
 from gridnav.problem.layout import Layout
 from gridnav.problem.reward import Reward
 from gridnav.problem.task import Task
+
+from .base import OnProgress
+from .tabular import TabularAgent
 
 
 class Planner(TabularAgent):

@@ -31,13 +31,13 @@ class PPOConfig:
 
     seed: int = 0
     """Of weights, exploration and batches."""
-    num_envs: int = 256
+    num_envs: int = 64
     """Environments stepped together."""
     n_steps: int = 64
     """Steps of each environment per rollout."""
-    batch_size: int = 2048
+    batch_size: int = 512
     """Transitions per gradient step."""
-    n_epochs: int = 5
+    n_epochs: int = 8
     """Passes over a rollout."""
     learning_rate: float = 1e-3
     """Adam's step size."""
@@ -51,7 +51,7 @@ class PPOConfig:
     """Logarithm of the policy's first standard deviation, as fraction of full speed."""
     hidden: tuple[int, ...] = (64, 64)
     """Units of the hidden layers (tanh) of policy and value network."""
-    reward_scale: float = 0.1
+    reward_scale: float = 1.0
     """Factor on the rewards the learner sees: it keeps the value network's gradient from crowding out the policy's."""
     target_success: float | None = 0.99
     """Training stops once this share of the last 400 episodes arrived; never before its steps are used up if none."""
@@ -72,6 +72,7 @@ class PPOAgent(Agent):
         if not isinstance(observation_space, Box) or not isinstance(action_space, Box):
             raise ValueError("PPO here needs Box spaces: take gridnav/Unicycle-v0 or gridnav/DiffDrive-v0")
         self.config = config
+        self._observation_space, self._action_space = observation_space, action_space
         # Two threads on these small networks are slower than one, and the thread count is part of the seed.
         torch.set_num_threads(1)
         torch.manual_seed(config.seed)
@@ -107,13 +108,16 @@ class PPOAgent(Agent):
         )
         model.policy.load_state_dict(self.policy.state_dict())
         model.set_logger(Logger(folder=None, output_formats=[]))
-        model.learn(steps, callback=_Reporter(adapter, steps, config.target_success, on_progress))
-        self.policy.load_state_dict(model.policy.state_dict())
+        try:
+            model.learn(steps, callback=_Reporter(adapter, steps, config.target_success, on_progress))
+        finally:
+            # What was learnt before an interrupt counts too.
+            self.policy.load_state_dict(model.policy.state_dict())
 
     def state(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         """Weights; spaces and hyper-parameters."""
         arrays = {name: tensor.numpy() for name, tensor in self.policy.state_dict().items()}
-        spaces = {"observation_space": self.policy.observation_space, "action_space": self.policy.action_space}
+        spaces = {"observation_space": self._observation_space, "action_space": self._action_space}
         return arrays, {
             "config": asdict(self.config),
             **{name: {"low": space.low.tolist(), "high": space.high.tolist()} for name, space in spaces.items()},
@@ -122,12 +126,12 @@ class PPOAgent(Agent):
     @classmethod
     def from_state(cls, arrays: dict[str, NDArray[Any]], values: dict[str, Any]) -> Self:
         """An agent with these weights."""
-        spaces = [
-            Box(*(np.array(values[name][side], dtype=np.float32) for side in ("low", "high")))
+        observation_space, action_space = (
+            Box(np.array(values[name]["low"], np.float32), np.array(values[name]["high"], np.float32))
             for name in ("observation_space", "action_space")
-        ]
+        )
         config = PPOConfig(**{**values["config"], "hidden": tuple(values["config"]["hidden"])})
-        agent = cls(*spaces, config)
+        agent = cls(observation_space, action_space, config)
         agent.policy.load_state_dict({name: torch.from_numpy(array.copy()) for name, array in arrays.items()})
         return agent
 

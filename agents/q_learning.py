@@ -47,7 +47,9 @@ class QLearning(TabularAgent):
 
     kind = "q-learning"
 
-    def __init__(self, observation_space: gym.Space[Any], action_space: gym.Space[Any], config: QLearningConfig) -> None:
+    def __init__(
+        self, observation_space: gym.Space[Any], action_space: gym.Space[Any], config: QLearningConfig
+    ) -> None:
         if not isinstance(observation_space, Discrete) or not isinstance(action_space, Discrete):
             raise ValueError("Q-learning needs Discrete spaces: take gridnav/GridWorld-v0 with cell_goal or cell")
         super().__init__(np.zeros((int(observation_space.n), int(action_space.n))))
@@ -68,7 +70,7 @@ class QLearning(TabularAgent):
             # Exploration: with probability epsilon a move uniform over all moves.
             explores = rng.random(n) < epsilon
             actions = np.where(explores, rng.integers(q.shape[1], size=n), self.act(observations))
-            next_observations, rewards, terminated, truncated, info = env.step(actions)
+            next_observations, rewards, terminated, _, info = env.step(actions)
 
             # A truncated episode goes on beyond its last state, a terminated one does not.
             reached = _reached(next_observations, info)

@@ -7,8 +7,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from .base import Agent
 from gridnav.problem.types import FloatArray
+
+from .base import Agent
 
 
 class TabularAgent(Agent):

@@ -3,7 +3,9 @@
 import gymnasium as gym
 
 from .diff_drive import DiffDriveEnv, DiffDriveVectorEnv
+from .gl import BACK_ENDS as GL_BACK_ENDS
 from .gl import RenderingError
+from .gl import works as gl_works
 from .grid_moves import GridMoves, MoveDriver
 from .grid_world import GridWorldEnv, GridWorldVectorEnv
 from .lidar import scan
@@ -12,6 +14,7 @@ from .observation import FeatureVector
 from .unicycle import UnicycleEnv, UnicycleVectorEnv
 
 __all__ = [
+    "GL_BACK_ENDS",
     "DiffDriveEnv",
     "DiffDriveVectorEnv",
     "FeatureVector",
@@ -24,6 +27,7 @@ __all__ = [
     "RenderingError",
     "UnicycleEnv",
     "UnicycleVectorEnv",
+    "gl_works",
     "scan",
 ]
 

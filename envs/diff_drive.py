@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import mujoco
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from mujoco.batch import Batch
 
-from . import gl
-from .mjcf import build_model
-from .navigation import Motion
-from .robot_world import RobotEnv, RobotVectorEnv, towards
 from gridnav.problem.geodesic import clearances
 from gridnav.problem.types import AnyArray, BoolArray, FloatArray, InputError, IntArray
 
+from . import gl
+from .mjcf import build_model
+from .navigation import Motion
+from .robot_world import RELEASE_M, RobotEnv, RobotVectorEnv, towards
+
 BUMPER_PERIOD_S = 0.05
-"""The bumper is looked at, and the motors are cut at a contact, this often: the Burger publishes its sensors at 20 Hz."""
+"""The bumper is looked at this often: the Burger publishes its sensors at 20 Hz."""
+CONTACT_MARGIN_M = 0.003
+"""A bumper this close to a wall after a contact still counts as pressed: soft contacts push the robot out a little."""
 CAMERAS = ("above", "chase", "onboard")
 
 
@@ -33,7 +36,7 @@ class DiffDriveVectorEnv(RobotVectorEnv):
         shared: See ``RobotVectorEnv``.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata: dict[str, Any] = {
         "render_modes": ["rgb_array"],
         "render_fps": 5,
         "autoreset_mode": AutoresetMode.SAME_STEP,
@@ -85,33 +88,32 @@ class DiffDriveVectorEnv(RobotVectorEnv):
         wheels = self.robot.wheel_fractions(actions)
         forward = wheels.mean(axis=1)
         before = self._batch.state.copy()
-        n = self.num_envs
-        travelled, hit, inner = np.zeros(n), np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+        n, stops = self.num_envs, self.task.on_collision != "slide"
+        travelled, hit, hit_inner = np.zeros(n), np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
         position = self._qpos[:, :2].copy()
-        self._ctrl[:] = wheels * self.robot.max_wheel_speed_rad_s
+        gap, direction, inner = clearances(position, self.layout)
         for n_substeps in self._looks:
+            into = towards(direction, _headings(self._qpos), forward)
+            refused = stops & self._in_contact & into & (gap < self.robot.radius_m + CONTACT_MARGIN_M)
+            allowed = wheels - np.where(refused, forward, 0.0)[:, None]
+            self._ctrl[:] = allowed * self.robot.max_wheel_speed_rad_s
             self._batch.step(nstep=n_substeps)
-            touches, touches_inner = self._bump(forward)
-            hit |= touches
-            inner |= touches_inner
-            if self.task.on_collision != "slide":
-                self._ctrl[touches] = 0.0
+            gap, direction, inner = clearances(self._qpos[:, :2], self.layout)
+            touches = (gap < self.robot.radius_m) & towards(direction, _headings(self._qpos), forward)
+            begins = touches & ~self._in_contact if stops else touches
+            hit |= begins
+            hit_inner |= begins & inner
+            self._in_contact = (self._in_contact | touches) & (gap < self.robot.radius_m + RELEASE_M)
             travelled += np.hypot(*(self._qpos[:, :2] - position).T)
             position[:] = self._qpos[:, :2]
         failed = self._diverged()
         if failed.any():
             self._recover(np.flatnonzero(failed), before)
             travelled[failed] = 0.0
-            hit, inner = hit & ~failed, inner & ~failed
+            hit, hit_inner = hit & ~failed, hit_inner & ~failed
         self._sense()
         self._last_action = actions
-        return Motion(travelled, hit, inner, failed)
-
-    def _bump(self, forward: FloatArray) -> tuple[BoolArray, BoolArray]:
-        """Which robots press their bumper against a wall, and whether it is an inner one."""
-        gap, direction, inner = clearances(self._qpos[:, :2], self.layout)
-        touches = (gap < self.robot.radius_m) & towards(direction, _headings(self._qpos), forward)
-        return touches, touches & inner
+        return Motion(travelled, hit, hit_inner, failed)
 
     def _sense(self) -> None:
         heading = _headings(self._qpos)
@@ -173,8 +175,8 @@ class DiffDriveEnv(RobotEnv[DiffDriveVectorEnv]):
 
     ## Observation space
 
-    ``Box`` of 35 numbers, the feature vector of ``gridnav.envs.observation``: 24 lidar beams, goal distance and bearing,
-    position, heading, speed and last action.
+    ``Box`` of 35 numbers, the feature vector of ``gridnav.envs.observation``: 24 lidar beams, goal distance and
+    bearing, position, heading, speed and last action.
 
     ## Reward
 
@@ -183,15 +185,16 @@ class DiffDriveEnv(RobotEnv[DiffDriveVectorEnv]):
     ## Episode start and end
 
     The task draws start, goal and heading; the robot starts at rest at a cell's centre. ``terminated`` within 0.15 m of
-    the goal's centre, or when the physics diverges (``info["physics_error"]``); a wall stops the motors for the rest of
-    the control period. ``truncated`` after ``max_episode_steps`` (500 with ``gym.make``: 100 s).
+    the goal's centre, or when the physics diverges (``info["physics_error"]``); a wall refuses commands into
+    it until the robot has turned or backed off. ``truncated`` after ``max_episode_steps`` (500 with
+    ``gym.make``: 100 s).
 
     Args:
         shared: ``layout``, ``task``, ``reward``, ``render_mode``, ``control_period_s``, ``camera``, ``width``,
             ``height`` and ``max_episode_steps``, see ``DiffDriveVectorEnv``.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata: dict[str, Any] = {
         "render_modes": DiffDriveVectorEnv.metadata["render_modes"],
         "render_fps": DiffDriveVectorEnv.metadata["render_fps"],
     }

@@ -93,8 +93,8 @@ class GridMoves(gym.Wrapper[Any, Any, Any, Any]):
     """Lets an agent of the grid drive a continuous robot: one step is a whole move to the next cell.
 
     A move ends at the next cell's centre, at a collision, or with the episode. It is a step of a semi-Markov decision
-    process (Sutton, Precup and Singh 1999): the reward is the discounted sum of the move's rewards, ``info["discount"]``
-    the discount of the whole move, and ``info["duration_s"]`` its time in seconds.
+    process (Sutton, Precup and Singh 1999): the reward is the discounted sum of the move's rewards,
+    ``info["discount"]`` the discount of the whole move, and ``info["duration_s"]`` its time in seconds.
 
     Args:
         env: ``gridnav/Unicycle-v0`` or ``gridnav/DiffDrive-v0``.
@@ -105,10 +105,11 @@ class GridMoves(gym.Wrapper[Any, Any, Any, Any]):
         super().__init__(env)
         if observation not in ("cell_goal", "cell", "features"):
             raise InputError(f"observation {observation!r} is none of cell_goal, cell, features")
-        self._robot_env: Any = env.unwrapped
+        robot_env: Any = env.unwrapped
+        self._robot_env = robot_env
         self._mode = observation
-        layout: Layout = self._robot_env.layout
-        sizes = {"cell_goal": layout.n_cells * len(self._robot_env.worlds.goal_cells), "cell": layout.n_cells}
+        layout: Layout = robot_env.layout
+        sizes = {"cell_goal": layout.n_cells * len(robot_env.worlds.goal_cells), "cell": layout.n_cells}
         self.observation_space = env.observation_space if observation == "features" else Discrete(sizes[observation])
         self.action_space = Discrete(4)
         self._pose = np.zeros((1, 3))
@@ -128,7 +129,8 @@ class GridMoves(gym.Wrapper[Any, Any, Any, Any]):
         move = np.asarray(action)
         if move.shape != () or move.dtype.kind not in "iu" or not 0 <= move <= 3:
             raise InputError(f"action {action!r} is outside Discrete(4): 0 up, 1 down, 2 left, 3 right")
-        robot, gamma = self._robot_env, self._robot_env.worlds.step_gamma
+        robot = self._robot_env
+        gamma: float = robot.worlds.step_gamma
         driver = MoveDriver(robot.layout, robot.worlds.robot, robot.control_period_s, 1)
         driver.begin(np.array([0]), self._pose, move[None])
         reward, discount, steps, over = 0.0, 1.0, 0, False

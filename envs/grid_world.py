@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Discrete
 from gymnasium.vector import AutoresetMode
 
-from .navigation import Motion, NavigationEnv, NavigationVectorEnv
-from .painter import Painter
 from gridnav.problem.geodesic import cell_distances
 from gridnav.problem.grid_mdp import MOVE_HEADINGS_RAD, SIDEWAYS, MoveTable
 from gridnav.problem.types import AnyArray, BoolArray, FloatArray, InputError, IntArray
+
+from .navigation import Motion, NavigationEnv, NavigationVectorEnv
+from .painter import Painter
 
 ObservationMode = Literal["cell_goal", "cell", "features"]
 OBSERVATION_MODES = ("cell_goal", "cell", "features")
@@ -22,7 +23,7 @@ OBSERVATION_MODES = ("cell_goal", "cell", "features")
 class GridWorldVectorEnv(NavigationVectorEnv):
     """``num_envs`` robots on the grid, stepped as arrays; see ``GridWorldEnv`` for the page of the environment."""
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata: dict[str, Any] = {
         "render_modes": ["ansi", "rgb_array", "human"],
         "render_fps": 10,
         "autoreset_mode": AutoresetMode.SAME_STEP,
@@ -125,7 +126,9 @@ class GridWorldVectorEnv(NavigationVectorEnv):
         )
 
     def _distances(self, ids: IntArray | slice) -> FloatArray:
-        distances: FloatArray = self._moves_to_goal[self._table_row[self._numbers(self._goal[ids])], self._position[ids]]
+        distances: FloatArray = self._moves_to_goal[
+            self._table_row[self._numbers(self._goal[ids])], self._position[ids]
+        ]
         return distances
 
     def _arrived(self) -> BoolArray:
@@ -143,7 +146,7 @@ class GridWorldVectorEnv(NavigationVectorEnv):
         return self._position[ids] * len(self.goal_cells) + self._goal_rank[self._numbers(self._goal[ids])]
 
     def render(self) -> tuple[Any, ...] | None:
-        """A picture or text per environment, in the form of ``render_mode``; the window of ``human`` shows the first."""
+        """A picture or text per environment, as ``render_mode`` says; the window of ``human`` shows the first."""
         if self.render_mode is None:
             return None
         if self.render_mode == "ansi":
@@ -184,7 +187,7 @@ class GridWorldEnv(NavigationEnv[GridWorldVectorEnv]):
 
     | observation | space |
     | --- | --- |
-    | ``cell_goal`` (default) | ``Discrete(cells x goals)``: cell * n_goals + goal; cells row by row, goals in the order of ``goal_cells`` |
+    | ``cell_goal`` (default) | ``Discrete(cells x goals)``: cell * n_goals + goal, cells row by row, goals as in ``goal_cells`` |
     | ``cell`` | ``Discrete(cells)``: the robot's cell alone, which does not say where the goal is |
     | ``features`` | ``Box``: the feature vector of the robot worlds, with the lidar at the cell's centre |
 
@@ -194,8 +197,8 @@ class GridWorldEnv(NavigationEnv[GridWorldVectorEnv]):
 
     ## Episode start and end
 
-    The task draws start and goal. ``terminated`` at the goal (and at a collision, where the task says so); ``truncated``
-    after ``max_episode_steps`` (100 with ``gym.make``).
+    The task draws start and goal. ``terminated`` at the goal (and at a collision, where the task says so);
+    ``truncated`` after ``max_episode_steps`` (100 with ``gym.make``).
 
     Args:
         observation: One of the three above.
@@ -204,7 +207,7 @@ class GridWorldEnv(NavigationEnv[GridWorldVectorEnv]):
             ``NavigationVectorEnv``.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata: dict[str, Any] = {
         "render_modes": GridWorldVectorEnv.metadata["render_modes"],
         "render_fps": GridWorldVectorEnv.metadata["render_fps"],
     }

@@ -1,11 +1,12 @@
 """What all worlds share: episodes, reward, info and autoreset, written once on arrays.
 
-A world is a ``NavigationVectorEnv`` that says how its robots are placed, driven and observed. Its single environment is a
-``NavigationEnv`` around the same world with a batch of one, so that scalar and vector agree bit for bit.
+A world is a ``NavigationVectorEnv`` that says how its robots are placed, driven and observed. Its single environment is
+a ``NavigationEnv`` around the same world with a batch of one, so that scalar and vector agree bit for bit.
 """
 
 from __future__ import annotations
 
+import numbers
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,16 +15,17 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from .lidar import scan
-from .observation import FeatureVector
 from gridnav.problem.layout import Layout
 from gridnav.problem.reward import TERM_NAMES, Reward, Transition, total
 from gridnav.problem.robot import BURGER, Robot
 from gridnav.problem.task import DRAWS_PER_EPISODE, Task
 from gridnav.problem.types import AnyArray, BoolArray, Cell, FloatArray, InputError, IntArray
+
+from .lidar import scan
+from .observation import FeatureVector
 
 OPTIONS = ("start", "goal", "heading_rad", "layout")
 INFO_KEYS = (
@@ -97,14 +99,16 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         self._streams = RandomStreams([np.random.default_rng() for _ in range(self.num_envs)])
 
         n = self.num_envs
-        self._pose = np.zeros((n, 3))
+        self._pose: FloatArray = np.zeros((n, 3))
         self._start, self._goal = np.zeros((n, 2), dtype=np.int64), np.zeros((n, 2), dtype=np.int64)
         self._goal_w = np.zeros((n, 2))
-        self._distance, self._shortest_path_m = np.zeros(n), np.zeros(n)
+        self._distance: FloatArray = np.zeros(n)
+        self._shortest_path_m: FloatArray = np.zeros(n)
         self._steps, self._collisions = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
         self._hit, self._at_goal, self._failed = (np.zeros(n, dtype=bool) for _ in range(3))
-        self._path_length_m = np.zeros(n)
-        self._last_action, self._speed = np.zeros((n, 2)), np.zeros((n, 2))
+        self._path_length_m: FloatArray = np.zeros(n)
+        self._last_action: FloatArray = np.zeros((n, 2))
+        self._speed: FloatArray = np.zeros((n, 2))
         self._fixed: dict[str, Any] = {}
 
         self.layout = Layout.load(layout)
@@ -157,8 +161,8 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
 
         Args:
             seed: One number, from which every environment gets a stream of its own, or one per environment.
-            options: ``start`` and ``goal`` cells (row, column), ``heading_rad`` and ``layout``, for all environments and
-                for the episodes that follow until the next reset.
+            options: ``start`` and ``goal`` cells (row, column), ``heading_rad`` and ``layout``, for all environments
+                and for the episodes that follow until the next reset.
 
         Raises:
             InputError: When an option breaks a rule; nothing has changed then.
@@ -174,9 +178,7 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         self._begin(ids)
         return self._observe(ids), self._info(_zero_terms(self.num_envs))
 
-    def step(
-        self, actions: AnyArray
-    ) -> tuple[AnyArray, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
+    def step(self, actions: AnyArray) -> tuple[AnyArray, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
         """Drive every robot for one step.
 
         Raises:
@@ -348,12 +350,11 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         for key in ("start", "goal"):
             if options.get(key) is not None:
                 fixed[key] = np.array(_free_cell(options[key], key, layout or self.layout))
-        if "start" in fixed and "goal" in fixed:
-            if (fixed["start"] == fixed["goal"]).all():
-                raise InputError(f"reset options start and goal are both {options['start']}: they must differ")
+        if "start" in fixed and "goal" in fixed and (fixed["start"] == fixed["goal"]).all():
+            raise InputError(f"reset options start and goal are both {options['start']}: they must differ")
         heading = options.get("heading_rad")
         if heading is not None:
-            if isinstance(heading, bool | str) or not np.isscalar(heading) or not np.isfinite(heading):
+            if isinstance(heading, bool) or not isinstance(heading, numbers.Real) or not np.isfinite(float(heading)):
                 raise InputError(f"reset option heading_rad {heading!r} must be a finite number of radians")
             fixed["heading_rad"] = float(heading)
         return fixed, layout

@@ -77,7 +77,9 @@ class Painter:
         return surface
 
     @staticmethod
-    def _mark(surface: pygame.Surface, cell: IntArray, colour: tuple[int, int, int], side: float, *, width: int) -> None:
+    def _mark(
+        surface: pygame.Surface, cell: IntArray, colour: tuple[int, int, int], side: float, *, width: int
+    ) -> None:
         box = pygame.Rect(0, 0, round(side * 0.8), round(side * 0.8))
         box.center = (round((cell[1] + 0.5) * side), round((cell[0] + 0.5) * side))
         pygame.draw.rect(surface, colour, box, width=width, border_radius=4)

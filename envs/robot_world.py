@@ -8,13 +8,21 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 
-from .navigation import NavigationEnv, NavigationVectorEnv, VectorWorld
 from gridnav.problem.geodesic import Geodesic
 from gridnav.problem.types import AnyArray, BoolArray, FloatArray, InputError, IntArray
+
+from .navigation import NavigationEnv, NavigationVectorEnv, VectorWorld
+
+RELEASE_M = 0.01
+"""A contact is over once the bumper is this far from the wall: until then it is counted and charged once."""
 
 
 class RobotVectorEnv(NavigationVectorEnv):
     """``num_envs`` robots that take a forward and a turning command per control period.
+
+    A robot whose bumper meets a wall is stopped: it can turn and back off, and commands into the wall are refused. The
+    contact is counted and charged once. Where the task lets robots slide, nothing is refused and every period with a
+    contact is charged.
 
     Args:
         num_envs: Robots in the batch.
@@ -40,11 +48,13 @@ class RobotVectorEnv(NavigationVectorEnv):
         super()._use_layout()
         self._geodesic = Geodesic(self.layout, self.robot.radius_m)
         self._goal_number = np.zeros(self.num_envs, dtype=np.int64)
+        self._in_contact = np.zeros(self.num_envs, dtype=bool)
 
     def _place(self, ids: IntArray) -> None:
         for i in ids:
             row, col = self._goal[i].tolist()
             self._goal_number[i] = self._geodesic.goal_number((row, col))
+        self._in_contact[ids] = False
 
     def _distances(self, ids: IntArray | slice) -> FloatArray:
         return self._geodesic.distances(self._pose[ids, :2], self._goal_number[ids]) / self.layout.cell_size_m

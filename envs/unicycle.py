@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import numba
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from .painter import Painter
-from .navigation import Motion
-from .robot_world import RobotEnv, RobotVectorEnv
 from gridnav.problem.geodesic import clearance
 from gridnav.problem.types import AnyArray, BoolArray, FloatArray
+
+from .navigation import Motion
+from .painter import Painter
+from .robot_world import RELEASE_M, RobotEnv, RobotVectorEnv
 
 SUBSTEP_S = 0.01
 """Where a wall is near, contact is looked for this often: a robot at full speed moves 2 mm in it."""
@@ -21,7 +22,7 @@ SUBSTEP_S = 0.01
 class UnicycleVectorEnv(RobotVectorEnv):
     """``num_envs`` kinematic robots, stepped as arrays; see ``UnicycleEnv`` for the page of the environment."""
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata: dict[str, Any] = {
         "render_modes": ["rgb_array", "human"],
         "render_fps": 5,
         "autoreset_mode": AutoresetMode.SAME_STEP,
@@ -47,6 +48,7 @@ class UnicycleVectorEnv(RobotVectorEnv):
             self.task.on_collision == "slide",
             self.layout.walls,
             self.layout.cell_size_m,
+            self._in_contact,
             travelled,
             hit,
             inner,
@@ -88,8 +90,8 @@ class UnicycleEnv(RobotEnv[UnicycleVectorEnv]):
 
     ## Observation space
 
-    ``Box`` of 35 numbers, the feature vector of ``gridnav.envs.observation``: 24 lidar beams, goal distance and bearing,
-    position, heading, speed and last action.
+    ``Box`` of 35 numbers, the feature vector of ``gridnav.envs.observation``: 24 lidar beams, goal distance and
+    bearing, position, heading, speed and last action.
 
     ## Reward
 
@@ -98,15 +100,15 @@ class UnicycleEnv(RobotEnv[UnicycleVectorEnv]):
     ## Episode start and end
 
     The task draws start, goal and heading; the robot starts at a cell's centre. ``terminated`` within 0.15 m of the
-    goal's centre; a wall stops the robot for the rest of the control period. ``truncated`` after ``max_episode_steps``
-    (500 with ``gym.make``: 100 s).
+    goal's centre; a wall refuses commands into it until the robot has turned or backed off. ``truncated`` after
+    ``max_episode_steps`` (500 with ``gym.make``: 100 s).
 
     Args:
         shared: ``layout``, ``task``, ``reward``, ``render_mode``, ``control_period_s`` and ``max_episode_steps``, see
             ``RobotVectorEnv`` and ``NavigationVectorEnv``.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata: dict[str, Any] = {
         "render_modes": UnicycleVectorEnv.metadata["render_modes"],
         "render_fps": UnicycleVectorEnv.metadata["render_fps"],
     }
@@ -125,35 +127,39 @@ def _roll(
     slides: bool,
     walls: BoolArray,
     cell: float,
+    in_contact: BoolArray,
     travelled: FloatArray,
     hits: BoolArray,
     inner_hits: BoolArray,
 ) -> None:
-    """Constant-twist arcs (Siegwart et al. 2011, section 3.2.3), cut where the bumper meets a wall."""
+    """Constant-twist arcs (Siegwart et al. 2011, section 3.2.3), without their forward part at a wall."""
     n_substeps = int(np.ceil(period / SUBSTEP_S - 1e-9))
     for i in range(len(poses)):
         x, y, heading = poses[i]
         speed, turn = speeds[i], turns[i]
-        # Far from walls one arc does; near them, short ones that stop at contact.
+        # Far from walls one arc does; near them, short ones that look for contact.
         gap, _, _, _ = clearance(x, y, walls, cell)
-        n = 1 if gap - radius > abs(speed) * period else n_substeps
+        n = 1 if gap - radius > abs(speed) * period + RELEASE_M else n_substeps
         dt = period / n
         for _ in range(n):
             turned = turn * dt
             # sin(a)/a of half the angle turned: chord over arc, 1 for a straight line.
             chord = speed * dt * (np.sin(turned / 2) / (turned / 2) if abs(turned) > 1e-12 else 1.0)
-            way = abs(speed) * dt
             to_x, to_y = x + chord * np.cos(heading + turned / 2), y + chord * np.sin(heading + turned / 2)
+            way = abs(speed) * dt
             gap, ux, uy, inner = clearance(to_x, to_y, walls, cell)
-            if gap < radius and speed != 0.0 and (to_x - x) * ux + (to_y - y) * uy > 0.0:
-                hits[i] = True
-                inner_hits[i] = inner_hits[i] or inner
-                if not slides:
-                    break
-                to_x, to_y = to_x + ux * (gap - radius), to_y + uy * (gap - radius)
-                if clearance(to_x, to_y, walls, cell)[0] < radius - 1e-6:  # pushed into a second wall
+            if gap < radius and (to_x - x) * ux + (to_y - y) * uy > 0.0:
+                if slides or not in_contact[i]:
+                    hits[i] = True
+                    inner_hits[i] = inner_hits[i] or inner
+                in_contact[i] = True
+                if slides:
+                    to_x, to_y = to_x + ux * (gap - radius), to_y + uy * (gap - radius)
+                if not slides or clearance(to_x, to_y, walls, cell)[0] < radius - 1e-6:  # a second wall
                     to_x, to_y = x, y
                 way = np.hypot(to_x - x, to_y - y)
+            elif gap > radius + RELEASE_M:
+                in_contact[i] = False
             travelled[i] += way
             x, y, heading = to_x, to_y, heading + turned
         poses[i, 0], poses[i, 1], poses[i, 2] = x, y, heading

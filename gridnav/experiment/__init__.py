@@ -1,0 +1,1 @@
+"""What one does with worlds and agents: train, evaluate, climb the ladder."""

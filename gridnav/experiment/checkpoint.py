@@ -1,7 +1,7 @@
 """Crash-safe, pickle-free files of a run.
 
-A checkpoint is a fresh directory: written aside, synced, renamed, then older ones pruned. Whatever instant a run is killed
-at, the newest directory under ``checkpoints/`` whose hashes verify is whole.
+A checkpoint is a fresh directory: written aside, synced, renamed, then older ones pruned. Whatever instant a run is
+killed at, the newest directory under ``checkpoints/`` whose hashes verify is whole.
 """
 
 from __future__ import annotations

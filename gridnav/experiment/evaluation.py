@@ -7,9 +7,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 
-from gridnav.agents import Agent, OnProgress, Progress
+from gridnav.agents import Agent, OnProgress, Progress, TabularAgent
 from gridnav.envs import MoveDriver, NavigationVectorEnv, scan
 from gridnav.problem.metrics import Episode, Trace
 from gridnav.problem.types import AnyArray
@@ -26,6 +27,12 @@ def make_worlds(world: str, num_envs: int, **options: Any) -> NavigationVectorEn
     worlds = gym.make_vec(f"gridnav/{world}-v0", num_envs=num_envs, **options)
     assert isinstance(worlds, NavigationVectorEnv)
     return worlds
+
+
+def policy_for(agent: Agent, worlds: NavigationVectorEnv) -> Policy:
+    """The agent's own actions, or grid moves driven by it where it learnt on the grid and these are robots."""
+    on_grid = isinstance(worlds.single_action_space, Discrete)
+    return drive_by_moves(agent, worlds) if isinstance(agent, TabularAgent) and not on_grid else agent.act
 
 
 def drive_by_moves(agent: Agent, worlds: NavigationVectorEnv) -> Policy:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from gridnav.agents import Agent, OnProgress, Planner, Progress, QLearning, QLearningConfig
 from gridnav.envs import NavigationVectorEnv
 from gridnav.experiment.checkpoint import save_agent
-from gridnav.experiment.evaluation import Policy, drive_by_moves, evaluate, make_worlds
+from gridnav.experiment.evaluation import evaluate, make_worlds, policy_for
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
 from gridnav.problem.layout import Layout
 from gridnav.problem.metrics import Episode, Summary, summarise
@@ -69,6 +69,8 @@ class Problem:
 class Trained:
     """An agent and what it took to train it."""
 
+    name: str
+    """Name of its checkpoint and of its metrics."""
     agent: Agent
     steps: int
     """Environment steps."""
@@ -88,6 +90,8 @@ class Result:
     """What acts, in words."""
     carried: str
     """What it took over from another rung, in words."""
+    checkpoint: str
+    """Name of the agent's checkpoint in the run."""
     episodes: list[Episode]
     """The evaluation's records."""
     steps: int = 0
@@ -136,7 +140,7 @@ class Workshop:
         Raises:
             InputError: When the agent cannot act in that world.
         """
-        _check_fit(kind, world)
+        check_fit(kind, world)
         report = self._on_stage(f"training {name}")
         taken = 0
 
@@ -155,23 +159,25 @@ class Workshop:
             self._run_steps += taken
             save_agent(agent, self._run.checkpoints, self._run_steps, name=name)
             worlds.close()
-        return Trained(agent, taken, time.perf_counter() - began)
+        return Trained(name, agent, taken, time.perf_counter() - began)
 
-    def evaluate(self, name: str, agent: Agent, world: str, *, by_moves: bool = False) -> list[Episode]:
-        """Fixed-seed episodes of an agent.
+    def evaluate(self, name: str, trained: Trained, world: str, agent: str, *, carried: str = "") -> Result:
+        """Fixed-seed episodes of an agent in a world; an agent of the grid drives robots by grid moves.
 
         Args:
-            name: For the progress report.
-            agent: Who acts.
+            name: The row's name, unique in the run.
+            trained: Who acts.
             world: Where.
-            by_moves: Let an agent of the grid drive a robot through grid moves.
+            agent: Who acts, in words.
+            carried: What it took over from another rung, in words. Training counts in the row of the same name.
         """
         report = self._on_stage(f"evaluating {name}")
         worlds = self.problem.worlds(world, self.budget.episodes)
-        policy: Policy = drive_by_moves(agent, worlds) if by_moves else agent.act
-        episodes = evaluate(policy, worlds, on_progress=report)
+        episodes = evaluate(policy_for(trained.agent, worlds), worlds, on_progress=report)
         worlds.close()
-        return episodes
+        own = name == trained.name
+        steps, seconds = (trained.steps, trained.seconds) if own else (0, 0.0)
+        return Result(name, world, agent, carried, trained.name, episodes, steps, seconds)
 
     def _prepare(self, kind: AgentKind, world: str, start: Agent | None) -> tuple[Agent, NavigationVectorEnv, int]:
         problem = self.problem
@@ -194,7 +200,12 @@ class Workshop:
         return ppo, worlds, self.budget.ppo_steps
 
 
-def _check_fit(kind: AgentKind, world: str) -> None:
+def check_fit(kind: AgentKind, world: str) -> None:
+    """Whether an agent can act in a world.
+
+    Raises:
+        InputError: When it cannot, with the worlds where it can.
+    """
     on_grid = kind in ("plan", "q-learning")
     if on_grid != (world == "GridWorld"):
         right = "gridnav/GridWorld-v0" if on_grid else "gridnav/Unicycle-v0 or gridnav/DiffDrive-v0"

@@ -1,0 +1,1 @@
+"""What is to be solved: layout, task, reward, distances, metrics."""

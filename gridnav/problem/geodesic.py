@@ -187,7 +187,7 @@ def _shortest(
         totals[n_anchors] = np.hypot(goal[0] - x, goal[1] - y)
         out[i] = np.inf
         while True:
-            k = np.argmin(totals)
+            k = int(np.argmin(totals))
             if not np.isfinite(totals[k]):
                 break
             to_x, to_y = (goal[0], goal[1]) if k == n_anchors else (anchors[k, 0], anchors[k, 1])
@@ -238,9 +238,7 @@ def _point_box(x: float, y: float, left: float, bottom: float, side: float) -> f
 
 
 @numba.njit(cache=True)
-def _segment_box(
-    ax: float, ay: float, bx: float, by: float, left: float, bottom: float, side: float
-) -> float:
+def _segment_box(ax: float, ay: float, bx: float, by: float, left: float, bottom: float, side: float) -> float:
     """Distance between a segment and a square, 0 where they meet."""
     enter, leave = 0.0, 1.0
     for start, step, near in ((ax, bx - ax, left), (ay, by - ay, bottom)):
@@ -273,7 +271,7 @@ def _clearances(
 
 @numba.njit(cache=True)
 def clearance(x: float, y: float, walls: BoolArray, cell: float) -> tuple[float, float, float, bool]:
-    """``clearances`` of one point, for compiled loops: distance, direction x and y, whether the wall is an inner one."""
+    """``clearances`` of one point, for compiled loops: distance, direction x and y, whether the wall is inner."""
     n_rows, n_cols = walls.shape
     nearest, to_x, to_y, inner = cell, 1.0, 0.0, False
     for gap, ux, uy in (

@@ -1,7 +1,7 @@
 """Proof that a reward is sane: no behaviour that avoids the goal may earn as much as reaching it.
 
-On the grid the proof is exact: the best goal-avoiding return is the solution of the same Markov decision process with the
-moves into the goal forbidden. Robots are tried with scripted behaviours, in ``gridnav.experiment.robot_lint``.
+On the grid the proof is exact: the best goal-avoiding return is the solution of the same Markov decision process with
+the moves into the goal forbidden. Robots are tried with scripted behaviours, in ``gridnav.experiment.robot_lint``.
 """
 
 from __future__ import annotations
@@ -83,7 +83,9 @@ def lint_grid(reward: Reward, layout: Layout, task: Task, *, gamma: float | None
                 start=(start // layout.n_cols, start % layout.n_cols),
                 goal=goal,
                 avoiding_return=float(avoiding[start].max()),
-                reaching_return=float(best[start]) if margins.min() > 1e-6 else _return_of_shortest(mdp, start, goal, layout),
+                reaching_return=float(best[start])
+                if margins.min() > 1e-6
+                else _return_of_shortest(mdp, start, goal, layout),
             )
             worst = float(margins.min()), finding
     if worst is None:
@@ -94,8 +96,8 @@ def lint_grid(reward: Reward, layout: Layout, task: Task, *, gamma: float | None
 def lint_idling(reward: Reward, layout: Layout, task: Task) -> Finding:
     """Whether standing still earns anything, at the cell where it earns most.
 
-    A learner that sees a fraction of the way ahead settles for what pays at once, so idling must cost at every distance,
-    also where the goal would pay more.
+    A learner that sees a fraction of the way ahead settles for what pays at once, so idling must cost at every
+    distance, also where the goal would pay more.
 
     Returns:
         The cell and goal where idling forever does best; sane when it costs there.

@@ -105,6 +105,14 @@ class Reward:
             "progress": self.progress * progress(step, self.gamma),
         }
 
+    def potential(self, distance: FloatArray) -> FloatArray:
+        """What shaping adds to a state's value, negated: add it to learnt values to get those of the unshaped reward.
+
+        Args:
+            distance: Shortest way to the goal, cells, any shape.
+        """
+        return -self.progress * distance
+
 
 def progress(step: Transition, gamma: float) -> FloatArray:
     """Getting closer to the goal along the free way: ``gamma**dt * phi(s') - phi(s)`` with ``phi = -distance``.
@@ -160,6 +168,10 @@ class TutorialReward(Reward):
             "time": np.where(step.time_up, -1.0, -self.time_cost * step.duration * ordinary),
             "progress": closeness * step.duration * ordinary,
         }
+
+    def potential(self, distance: FloatArray) -> FloatArray:
+        """Zero: closeness is paid as such and is no potential."""
+        return np.zeros_like(distance)
 
 
 Reward.PRESETS.update(default=Reward, seed=TutorialReward)

@@ -26,9 +26,10 @@ class Task:
     goals: Literal["layout", "any"] = "layout"
     """Goal cells: those of the layout, or every free cell that the starts reach."""
     on_collision: Literal["stop", "slide", "end"] = "stop"
-    """A robot that touches a wall is stopped for the rest of its control period, or slides on, or the episode ends.
+    """A robot that touches a wall is stopped and can only turn or back off, or slides on, or the episode ends.
 
-    It is counted and charged in all three. A grid robot stays in its cell under ``stop`` and ``slide``.
+    A contact is counted and charged in all three, once per contact or, sliding, in every step of it. A grid robot stays
+    in its cell under ``stop`` and ``slide``.
     """
     goal_radius_m: float = 0.15
     """A robot arrives when its axle's centre is this close to the goal cell's centre, metres."""
@@ -93,4 +94,3 @@ NAMED_TASKS = {
     "any": Task(starts="any", goals="any"),
     "fragile": Task(on_collision="end"),
 }
-

@@ -1,0 +1,417 @@
+"""The command line; the only module that prints.
+
+Exit codes: 0 done, 1 the lint found a fault, 2 bad input (one line on stderr, nothing written), 3 environment (disk,
+display, driver), 130 interrupted with a checkpoint written.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+import shlex
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from gridnav.agents import OnProgress
+from gridnav.agents import Progress as Learning
+from gridnav.display.recording import ViewerError
+from gridnav.envs import RenderingError
+from gridnav.experiment.run_directory import RunDirectory, read_json, write_json
+from gridnav.experiment.training import BudgetName, OnStage, Problem, Result
+from gridnav.problem.layout import NAMED_LAYOUTS, Layout
+from gridnav.problem.reward import Reward
+from gridnav.problem.task import Task
+from gridnav.problem.types import InputError
+
+Config = TypeVar("Config")
+stderr = Console(stderr=True, highlight=False, soft_wrap=True)
+stdout = Console(highlight=False, soft_wrap=True)
+TABLE_WIDTH = 132
+"""Columns of the results where the output goes to a file or pipe."""
+
+
+# ---- The commands and their flags --------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Run:
+    """Flags of the commands that make a run."""
+
+    budget: BudgetName = "default"
+    """quick: a first look; default: the real thing; full: more of everything."""
+    layout: str = "classic"
+    """A named layout, a text file, or a text."""
+    task: str = "default"
+    """Starts, goals and what a collision does: default, any or fragile."""
+    reward: str = "default"
+    """default, or seed for the tutorial's."""
+    seed: int = 0
+    """Of everything that is random in training."""
+    run_dir: Path | None = None
+    """Where the run's files go; runs/<run-id> below the current folder by default."""
+    config: Path | None = None
+    """A run's config.json: makes that run again; flags after it change it."""
+
+
+@dataclass(frozen=True)
+class Ladder(_Run):
+    """Climb from a plan on the grid to a MuJoCo robot and measure every rung."""
+
+    def __call__(self) -> int:
+        """Run it."""
+        from gridnav.experiment.ladder import climb
+
+        problem, config = self._problem()
+        run = RunDirectory.create(self.run_dir, "ladder", {"command": "ladder", **config})
+        with _progress() as on_stage:
+            results = climb(problem, self.budget, self.seed, run, _again(run), config, on_stage)
+        _show(results, run)
+        return 0
+
+    def _problem(self) -> tuple[Problem, dict[str, Any]]:
+        """The problem, and the configuration as JSON values that need no other file."""
+        problem = Problem.load(self.layout, self.task, self.reward)
+        layout = self.layout if self.layout in NAMED_LAYOUTS else problem.layout.to_text()
+        config = asdict(replace(self, layout=layout, run_dir=None, config=None))
+        return problem, {key: value for key, value in config.items() if value is not None}
+
+
+@dataclass(frozen=True)
+class Train(Ladder):
+    """Train and evaluate one agent in one world."""
+
+    agent: Literal["plan", "q-learning", "ppo"] = "q-learning"
+    """Who learns: plan is value iteration and needs no learning."""
+    env: Literal["gridnav/GridWorld-v0", "gridnav/Unicycle-v0", "gridnav/DiffDrive-v0"] | None = None
+    """Where; GridWorld for plan and q-learning, DiffDrive for ppo by default."""
+
+    def __call__(self) -> int:
+        """Run it."""
+        from gridnav.experiment.results import train_and_report
+        from gridnav.experiment.training import check_fit
+
+        world = self.env.split("/")[1].removesuffix("-v0") if self.env else _home(self.agent)
+        check_fit(self.agent, world)
+        problem, config = self._problem()
+        run = RunDirectory.create(self.run_dir, f"train-{self.agent}", {"command": "train", **config})
+        with _progress() as on_stage:
+            result = train_and_report(
+                problem, self.budget, self.seed, self.agent, world, run, _again(run), config, on_stage
+            )
+        _show([result], run)
+        return 0
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Evaluate the agents of a run again, on fixed seeds."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """A run directory."""
+    episodes: int = 200
+    """How many, for each agent."""
+    seed: int | None = None
+    """Of starts, goals and headings; that of every evaluation by default."""
+    output: Path | None = None
+    """A JSON file for all metrics and one row per episode."""
+
+    def __call__(self) -> int:
+        """Run it."""
+        from gridnav.experiment.results import evaluate_again, evaluation
+
+        if self.episodes < 1:
+            raise InputError(f"--episodes {self.episodes} must be at least 1")
+        run = RunDirectory.open(self.run)
+        with _progress() as on_stage:
+            results = evaluate_again(run, self.episodes, self.seed, on_stage)
+        if self.output is not None:
+            write_json(self.output, {"results": evaluation(results)})
+        _show(results, None)
+        return 0
+
+
+@dataclass(frozen=True)
+class View:
+    """Open a run's recording in the Rerun viewer, or draw it into a picture."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """A run directory."""
+    screenshot: Path | None = None
+    """Write a picture of the recording to this PNG file; needs no display."""
+    time_s: float | None = None
+    """The moment of the screenshot, seconds; the end by default."""
+
+    def __call__(self) -> int:
+        """Run it."""
+        from gridnav.display.recording import open_viewer, screenshot
+
+        recording = RunDirectory.open(self.run).recording
+        if not recording.is_file():
+            raise InputError(f"{str(self.run)!r} has no {recording.name}: the run has not finished")
+        if self.screenshot is None:
+            open_viewer(recording)
+            return 0
+        if not self.screenshot.parent.is_dir():
+            raise InputError(
+                f"--screenshot {str(self.screenshot)!r}: there is no folder {str(self.screenshot.parent)!r}"
+            )
+        screenshot(recording, self.screenshot, time_s=self.time_s)
+        stdout.print(str(self.screenshot))
+        return 0
+
+
+@dataclass(frozen=True)
+class LayoutCommand:
+    """Draw, check or generate a layout."""
+
+    action: Annotated[Literal["draw", "check", "generate"], tyro.conf.Positional] = "draw"
+    """draw it, check it, or generate a new one."""
+    source: Annotated[str, tyro.conf.Positional] = "classic"
+    """To draw or check: a named layout, a text file, or a text. To generate: random or maze."""
+    rows: int = 11
+    """Of a generated layout."""
+    columns: int = 11
+    """Of a generated layout."""
+    density: float = 0.2
+    """Share of walls of a random layout."""
+    seed: int = 0
+    """Of a generated layout."""
+    output: Path | None = None
+    """Write the layout to this text file instead of showing it."""
+
+    def __call__(self) -> int:
+        """Run it."""
+        layout = self._generated() if self.action == "generate" else Layout.load(self.source)
+        if self.action == "check":
+            stdout.print(
+                f"ok: {layout.name}, {layout.n_rows} x {layout.n_cols} cells of {layout.cell_size_m} m, "
+                f"{int(layout.walls.sum())} walls in {len(layout.wall_rectangles())} rectangles, "
+                f"{len(layout.start_cells)} starts, {len(layout.goal_cells)} goals, every goal reachable"
+            )
+        elif self.output is not None:
+            if self.output.exists():
+                raise InputError(f"--output {str(self.output)!r} exists: name a new file")
+            self.output.write_text(layout.to_text(), encoding="utf-8")
+        else:
+            sys.stdout.write(layout.to_text())
+        return 0
+
+    def _generated(self) -> Layout:
+        if self.source in ("random", "classic"):  # classic is the default that a generator has no use for
+            return Layout.random(n_rows=self.rows, n_cols=self.columns, density=self.density, seed=self.seed)
+        if self.source == "maze":
+            return Layout.maze(n_rows=self.rows, n_cols=self.columns, seed=self.seed)
+        raise InputError(f"unknown generator {self.source!r}: choose random or maze")
+
+
+@dataclass(frozen=True)
+class LintReward:
+    """Prove that avoiding the goal pays less than reaching it; exit code 1 where it does not."""
+
+    reward: str = "default"
+    """default, or seed for the tutorial's."""
+    layout: str = "classic"
+    """A named layout, a text file, or a text."""
+    task: str = "default"
+    """Starts, goals and what a collision does: default, any or fragile."""
+    goal: float | None = None
+    """Change this weight of the reward."""
+    collision_cost: float | None = None
+    """Change this weight of the reward."""
+    distance_cost: float | None = None
+    """Change this weight of the reward."""
+    time_cost: float | None = None
+    """Change this weight of the reward."""
+    progress: float | None = None
+    """Change this weight of the reward."""
+    gamma: float | None = None
+    """Change the discount per cell-time, in (0, 1)."""
+
+    def __call__(self) -> int:
+        """Run it."""
+        from gridnav.experiment.robot_lint import lint_robot
+        from gridnav.problem.lint import lint_grid, lint_idling
+
+        weights = {name: getattr(self, name) for name in asdict(Reward())}
+        reward = replace(Reward.load(self.reward), **{k: v for k, v in weights.items() if v is not None})
+        layout, task = Layout.load(self.layout), Task.load(self.task)
+        stdout.print(f"{self.reward} on {layout.name}: {reward}")
+        findings = [lint_grid(reward, layout, task), lint_idling(reward, layout, task)]
+        with stderr.status("driving scripted robots"):
+            findings += lint_robot(reward, layout, task)
+        for finding in findings:
+            stdout.print(str(finding), style=None if finding.is_sane else "bold red")
+        return 0 if all(finding.is_sane for finding in findings) else 1
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Print versions, cores and graphics back ends, and what is missing with the command that installs it."""
+
+    def __call__(self) -> int:
+        """Run it."""
+        from gridnav.experiment.doctor import diagnose
+
+        with stderr.status("looking at this machine"):
+            checks = diagnose()
+        for check in checks:
+            advice = (
+                f"  ({check.advice})" if check.advice and not (check.is_fine and check.found != "does not work") else ""
+            )
+            stdout.print(f"{'ok' if check.is_fine else '! ':<3}{check.name:<26}{check.found}{advice}")
+        return 0
+
+
+COMMANDS: dict[str, Callable[..., Any]] = {
+    "ladder": Ladder,
+    "train": Train,
+    "evaluate": Evaluate,
+    "view": View,
+    "layout": LayoutCommand,
+    "lint-reward": LintReward,
+    "doctor": Doctor,
+}
+
+
+# ---- From words to a command, and from errors to exit codes -------------------------------------
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run ``gridnav`` and leave with its exit code."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in words
+    words = [word for word in words if word != "--debug"]
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        sys.exit(_run(words))
+    except InputError as error:
+        code, message = 2, str(error)
+    except (ViewerError, RenderingError, OSError) as error:
+        code, message = 3, str(error)
+    except KeyboardInterrupt:
+        code, message = 130, "interrupted; what was learnt so far is saved in the run directory"
+    if debug:
+        stderr.print_exception()
+    stderr.print(f"gridnav: {message}", markup=False)
+    # Threads of a half-done step must not keep an interrupted run alive.
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code) if code == 130 else sys.exit(code)
+
+
+def _run(words: list[str]) -> int:
+    if not words or words[0] in ("-h", "--help"):
+        _help()
+        return 0
+    if words[0] not in COMMANDS:
+        raise InputError(f"unknown command {words[0]!r}: the commands are {', '.join(COMMANDS)}")
+    command: int = _parse(COMMANDS[words[0]], words[0], _with_config(words[0], words[1:]))()
+    return command
+
+
+def _parse(config: Callable[..., Config], name: str, words: list[str]) -> Config:
+    """The command with its flags; tyro's boxed errors become one line."""
+    problems = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(problems):
+            return tyro.cli(config, prog=f"gridnav {name}", args=words)
+    except SystemExit as leaving:
+        if leaving.code != 2:
+            raise
+    # The box holds a title, the error, and hints between rules: the error is what stands before the second rule.
+    lines = [line.strip(" ─│╭╮╰╯-") for line in problems.getvalue().splitlines()]
+    parts = re.split(r"\n\n+", "\n".join(lines))
+    message = " ".join(" ".join(parts[: 2 if len(parts) > 1 else 1]).split())
+    raise InputError(f"{message} (see 'gridnav {name} --help')")
+
+
+def _with_config(name: str, words: list[str]) -> list[str]:
+    """The flags of ``--config FILE`` in front of the others, so that both are checked alike and the others win."""
+    if "--config" not in words:
+        return words
+    at = words.index("--config")
+    if at + 1 == len(words):
+        raise InputError("--config needs a file: the config.json of a run")
+    stored = read_json(Path(words[at + 1]))
+    if stored.pop("command", name) != name:
+        raise InputError(f"--config {words[at + 1]} was made by another command than {name}")
+    flags = [f"--{key.replace('_', '-')}={value}" for key, value in stored.items()]
+    return flags + words[:at] + words[at + 2 :]
+
+
+def _help() -> None:
+    stdout.print(
+        "gridnav: robot navigation from a Q-table to a robot\n\nusage: gridnav COMMAND [--help] [--debug] ...\n"
+    )
+    for name, command in COMMANDS.items():
+        stdout.print(f"  {name:<13}{(command.__doc__ or '').splitlines()[0]}")
+
+
+def _home(agent: str) -> str:
+    return "DiffDrive" if agent == "ppo" else "GridWorld"
+
+
+def _again(run: RunDirectory) -> str:
+    """The command that makes the run again."""
+    return f"gridnav {read_json(run.config)['command']} --config {shlex.quote(str(run.config))}"
+
+
+# ---- What people see -----------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _progress() -> Iterator[OnStage]:
+    """A bar per training or evaluation, with the success rate."""
+    columns = (
+        TextColumn("{task.description:<32}"),
+        BarColumn(bar_width=30),
+        TextColumn("{task.completed:>9,.0f}/{task.total:,.0f}"),
+        TextColumn("{task.fields[rate]:>9,.0f}/s"),
+        TextColumn("success {task.fields[success]}"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=stderr) as bars:
+
+        def on_stage(name: str) -> OnProgress:
+            task = bars.add_task(name, total=None, rate=0.0, success="  -  ")
+
+            def on_progress(learning: Learning) -> None:
+                success = learning.metrics.get("success_rate", float("nan"))
+                seconds = bars.tasks[task].elapsed or 1.0
+                bars.update(
+                    task,
+                    completed=learning.steps,
+                    total=max(learning.total_steps, learning.steps),
+                    rate=learning.steps / seconds,
+                    success="  -  " if success != success else f"{success:5.1%}",
+                )
+
+            return on_progress
+
+        yield on_stage
+
+
+def _show(results: Sequence[Result], run: RunDirectory | None) -> None:
+    table = Table("rung", "world", "agent", "success (95 % interval)", "SPL", "SCT", "collided", "median time", "steps")
+    for result in results:
+        summary = result.summary
+        low, high = summary.success_interval
+        time = "-" if summary.time_to_goal_s is None else f"{summary.time_to_goal_s:.1f} s"
+        success = f"{summary.success_rate:6.1%} ({low:.1%} to {high:.1%})"
+        ratios = f"{summary.spl:.2f}", f"{summary.sct:.2f}", f"{summary.collision_rate:.1%}"
+        table.add_row(result.name, result.world, result.agent, success, *ratios, time, f"{result.steps:,}")
+    stdout.print(table, width=None if stdout.is_terminal else TABLE_WIDTH)
+    if run is not None:
+        stdout.print(f"report     {run.report}")
+        stdout.print(f"recording  {run.recording}   (gridnav view {shlex.quote(str(run.path))})")

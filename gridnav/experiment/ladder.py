@@ -1,0 +1,137 @@
+"""The ladder: from a plan to a Q-table to robots, and what each rung carries to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from gridnav.agents import TabularAgent
+from gridnav.experiment.results import (
+    pictures,
+    report_rows,
+    write_evaluation,
+    write_page,
+    write_rollout,
+)
+from gridnav.experiment.run_directory import MetricsLog, RunDirectory
+from gridnav.experiment.training import BUDGETS, BudgetName, OnStage, Problem, Result, Workshop
+
+QUESTION = "How far does a table learnt on the grid carry a wheeled robot, and what does a network save that starts on another?"
+SOLVED = 0.95
+"""The share of training episodes from which on a learner counts as there."""
+
+
+def climb(
+    problem: Problem,
+    budget: BudgetName,
+    seed: int,
+    run: RunDirectory,
+    command: str,
+    config: Mapping[str, Any],
+    on_stage: OnStage,
+) -> list[Result]:
+    """All rungs, in order, written to a run directory.
+
+    Args:
+        problem: What is to be solved.
+        budget: How much may be spent.
+        seed: Of everything that is random in training.
+        run: Where the files go.
+        command: What makes the run again, for the report.
+        config: The run's configuration, for the report.
+        on_stage: Told of every training and evaluation.
+    """
+    with MetricsLog(run) as log:
+        workshop = Workshop(problem, BUDGETS[budget], seed, run, log, on_stage)
+        plan = workshop.train("plan", "plan", "GridWorld")
+        results = [workshop.evaluate("plan", plan, "GridWorld", "value iteration")]
+
+        table = workshop.train("q-learning", "q-learning", "GridWorld")
+        results.append(workshop.evaluate("q-learning", table, "GridWorld", "Q-table"))
+        moves = "the whole table, driven by grid moves"
+        results.append(workshop.evaluate("q-table-unicycle", table, "Unicycle", "Q-table", carried=moves))
+        results.append(workshop.evaluate("q-table-diffdrive", table, "DiffDrive", "Q-table", carried=moves))
+
+        unicycle = workshop.train("ppo-unicycle", "ppo", "Unicycle")
+        results.append(workshop.evaluate("ppo-unicycle", unicycle, "Unicycle", "PPO from scratch"))
+        network = "the Unicycle's network"
+        results.append(workshop.evaluate("ppo-transferred", unicycle, "DiffDrive", "PPO as it is", carried=network))
+
+        scratch = workshop.train("ppo-scratch", "ppo", "DiffDrive")
+        results.append(workshop.evaluate("ppo-scratch", scratch, "DiffDrive", "PPO from scratch"))
+        warm = workshop.train("ppo-warm", "ppo", "DiffDrive", start=unicycle.agent)
+        results.append(workshop.evaluate("ppo-warm", warm, "DiffDrive", "PPO warm-started", carried=network))
+
+        assert isinstance(table.agent, TabularAgent)
+        _write(problem, seed, run, command, config, results, table.agent, log)
+    return results
+
+
+def _write(
+    problem: Problem,
+    seed: int,
+    run: RunDirectory,
+    command: str,
+    config: Mapping[str, Any],
+    results: Sequence[Result],
+    table: TabularAgent,
+    log: MetricsLog,
+) -> None:
+    write_evaluation(run, results, seed)
+    by_name = {result.name: result for result in results}
+    best = "ppo-warm" if _success(by_name["ppo-warm"]) >= _success(by_name["ppo-scratch"]) else "ppo-scratch"
+    side_by_side = [by_name["q-learning"], by_name["q-table-diffdrive"], by_name[best]]
+    properties = {"command": command, "training seed": seed, "run": run.path.name}
+    write_rollout(run, problem, side_by_side, properties)
+    curves = {
+        "ppo-unicycle": "Unicycle, from scratch",
+        "ppo-scratch": "DiffDrive, from scratch",
+        "ppo-warm": "DiffDrive, warm-started",
+    }
+    shown = pictures(run, problem, results, curves, table, log)
+    write_page(
+        run,
+        title=f"The ladder on {problem.layout.name}",
+        question=QUESTION,
+        conclusion=conclusion(by_name, log),
+        rows=report_rows(results, seed),
+        shown=shown,
+        command=command,
+        config=config,
+    )
+
+
+def conclusion(results: dict[str, Result], log: MetricsLog) -> str:
+    """What the numbers say, in two sentences."""
+    table, scratch, warm = (results[name] for name in ("q-table-diffdrive", "ppo-scratch", "ppo-warm"))
+    steps = {name: steps_to(log, name, SOLVED) for name in ("ppo-scratch", "ppo-warm")}
+    first = (
+        f"The Q-table drives the MuJoCo robot to its goal in {_success(table):.1%} of {len(table.episodes)} episodes "
+        f"without having seen it; PPO reaches {_success(scratch):.1%} from scratch and {_success(warm):.1%} started on "
+        "the Unicycle's network."
+    )
+    reached = {
+        name: f"after {_thousands(count)} steps" if count else "not within the budget" for name, count in steps.items()
+    }
+    second = (
+        f" In training, {SOLVED:.0%} success on the robot came {reached['ppo-scratch']} from scratch and "
+        f"{reached['ppo-warm']} warm-started."
+    )
+    return first + second
+
+
+def steps_to(log: MetricsLog, series: str, success: float) -> int | None:
+    """Environment steps until the training success rate first reached a share, or none."""
+    for steps, rate in zip(*log.curve(series, "success_rate"), strict=True):
+        if rate >= success:
+            return int(steps)
+    return None
+
+
+def _success(result: Result) -> float:
+    return result.summary.success_rate
+
+
+def _thousands(count: int) -> str:
+    # A narrow no-break space: the number stays on one line.
+    return f"{count:,}".replace(",", "\u202f")
