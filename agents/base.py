@@ -40,6 +40,8 @@ class Agent(ABC):
 
     kind: ClassVar[str]
     """Name on the command line and in files."""
+    files: ClassVar[tuple[str, ...]] = (WEIGHTS_FILE, AGENT_FILE)
+    """What ``save`` writes."""
 
     @abstractmethod
     def act(self, observations: NDArray[Any]) -> NDArray[Any]:

@@ -20,6 +20,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from .base import Agent, EpisodeWindow, OnProgress, Progress
@@ -40,7 +41,7 @@ class PPOConfig:
     n_epochs: int = 8
     """Passes over a rollout."""
     learning_rate: float = 1e-3
-    """Adam's step size."""
+    """Adam's step size at the beginning; it falls linearly to a tenth over the planned steps."""
     gamma: float = 0.99
     """Discount per control period."""
     gae_lambda: float = 0.95
@@ -99,7 +100,7 @@ class PPOAgent(Agent):
             n_steps=config.n_steps,
             batch_size=config.batch_size,
             n_epochs=config.n_epochs,
-            learning_rate=config.learning_rate,
+            learning_rate=LinearSchedule(config.learning_rate, config.learning_rate / 10, 1.0),
             gamma=config.gamma,
             gae_lambda=config.gae_lambda,
             ent_coef=config.ent_coef,

@@ -77,6 +77,10 @@ class DiffDriveVectorEnv(RobotVectorEnv):
 
     def _place(self, ids: IntArray) -> None:
         super()._place(ids)
+        self._rest(ids)
+
+    def _rest(self, ids: IntArray) -> None:
+        """Clear everything that the engine knows of robots and stand them at ``self._pose``."""
         self._batch.reset(ids)
         half = self._pose[ids, 2] / 2
         self._qpos[ids, :2] = self._pose[ids, :2]
@@ -87,28 +91,29 @@ class DiffDriveVectorEnv(RobotVectorEnv):
     def _drive(self, actions: AnyArray) -> Motion:
         wheels = self.robot.wheel_fractions(actions)
         forward = wheels.mean(axis=1)
-        before = self._batch.state.copy()
         n, stops = self.num_envs, self.task.on_collision != "slide"
         travelled, hit, hit_inner = np.zeros(n), np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
         position = self._qpos[:, :2].copy()
         gap, direction, inner = clearances(position, self.layout)
-        for n_substeps in self._looks:
-            into = towards(direction, _headings(self._qpos), forward)
-            refused = stops & self._in_contact & into & (gap < self.robot.radius_m + CONTACT_MARGIN_M)
-            allowed = wheels - np.where(refused, forward, 0.0)[:, None]
-            self._ctrl[:] = allowed * self.robot.max_wheel_speed_rad_s
-            self._batch.step(nstep=n_substeps)
-            gap, direction, inner = clearances(self._qpos[:, :2], self.layout)
-            touches = (gap < self.robot.radius_m) & towards(direction, _headings(self._qpos), forward)
-            begins = touches & ~self._in_contact if stops else touches
-            hit |= begins
-            hit_inner |= begins & inner
-            self._in_contact = (self._in_contact | touches) & (gap < self.robot.radius_m + RELEASE_M)
-            travelled += np.hypot(*(self._qpos[:, :2] - position).T)
-            position[:] = self._qpos[:, :2]
+        with np.errstate(invalid="ignore", over="ignore"):  # a robot whose physics diverges is dealt with below
+            for n_substeps in self._looks:
+                into = towards(direction, _headings(self._qpos), forward)
+                refused = stops & self._in_contact & into & (gap < self.robot.radius_m + CONTACT_MARGIN_M)
+                allowed = wheels - np.where(refused, forward, 0.0)[:, None]
+                self._ctrl[:] = allowed * self.robot.max_wheel_speed_rad_s
+                self._batch.step(nstep=n_substeps)
+                gap, direction, inner = clearances(self._qpos[:, :2], self.layout)
+                touches = (gap < self.robot.radius_m) & towards(direction, _headings(self._qpos), forward)
+                begins = touches & ~self._in_contact if stops else touches
+                hit |= begins
+                hit_inner |= begins & inner
+                self._in_contact = (self._in_contact | touches) & (gap < self.robot.radius_m + RELEASE_M)
+                travelled += np.hypot(*(self._qpos[:, :2] - position).T)
+                position[:] = self._qpos[:, :2]
         failed = self._diverged()
         if failed.any():
-            self._recover(np.flatnonzero(failed), before)
+            # Back to the last good pose, so that what is observed stays finite.
+            self._rest(np.flatnonzero(failed))
             travelled[failed] = 0.0
             hit, hit_inner = hit & ~failed, hit_inner & ~failed
         self._sense()
@@ -128,11 +133,6 @@ class DiffDriveVectorEnv(RobotVectorEnv):
         finite = np.isfinite(self._qpos).all(axis=1) & np.isfinite(self._qvel).all(axis=1)
         diverged: BoolArray = ~finite | (self._batch.warning[:, :, 1] > 0).any(axis=1)
         return diverged
-
-    def _recover(self, ids: IntArray, before: FloatArray) -> None:
-        """Put diverged robots back to the state before the step, so that what is observed stays finite."""
-        self._batch.reset(ids)
-        self._batch.state[ids] = before[ids]
 
     def render(self) -> tuple[Any, ...] | None:
         """A picture per environment, shape ``(height, width, 3)``, from the chosen camera.

@@ -7,11 +7,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Discrete
+from gymnasium.utils import RecordConstructorArgs
 
 from gridnav.problem.grid_mdp import MOVES
 from gridnav.problem.layout import Layout
 from gridnav.problem.robot import Robot
 from gridnav.problem.types import BoolArray, FloatArray, InputError, IntArray
+
+from .navigation import as_array
 
 ARRIVED_M = 0.04
 """A move is over this close to the cell's centre: what the robot drives in one control period."""
@@ -89,7 +92,7 @@ class MoveDriver:
         return over
 
 
-class GridMoves(gym.Wrapper[Any, Any, Any, Any]):
+class GridMoves(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Lets an agent of the grid drive a continuous robot: one step is a whole move to the next cell.
 
     A move ends at the next cell's centre, at a collision, or with the episode. It is a step of a semi-Markov decision
@@ -102,7 +105,8 @@ class GridMoves(gym.Wrapper[Any, Any, Any, Any]):
     """
 
     def __init__(self, env: gym.Env[Any, Any], *, observation: str = "cell_goal") -> None:
-        super().__init__(env)
+        RecordConstructorArgs.__init__(self, observation=observation)
+        gym.Wrapper.__init__(self, env)
         if observation not in ("cell_goal", "cell", "features"):
             raise InputError(f"observation {observation!r} is none of cell_goal, cell, features")
         robot_env: Any = env.unwrapped
@@ -126,7 +130,7 @@ class GridMoves(gym.Wrapper[Any, Any, Any, Any]):
         Raises:
             InputError: When the action is not in ``Discrete(4)``.
         """
-        move = np.asarray(action)
+        move = as_array(action)
         if move.shape != () or move.dtype.kind not in "iu" or not 0 <= move <= 3:
             raise InputError(f"action {action!r} is outside Discrete(4): 0 up, 1 down, 2 left, 3 right")
         robot = self._robot_env

@@ -13,7 +13,7 @@ from gridnav.problem.geodesic import cell_distances
 from gridnav.problem.grid_mdp import MOVE_HEADINGS_RAD, SIDEWAYS, MoveTable
 from gridnav.problem.types import AnyArray, BoolArray, FloatArray, InputError, IntArray
 
-from .navigation import Motion, NavigationEnv, NavigationVectorEnv
+from .navigation import Motion, NavigationEnv, NavigationVectorEnv, as_array
 from .painter import Painter
 
 ObservationMode = Literal["cell_goal", "cell", "features"]
@@ -95,7 +95,7 @@ class GridWorldVectorEnv(NavigationVectorEnv):
                 self._moves_to_goal = np.concatenate([self._moves_to_goal, row[None]])
 
     def _valid(self, actions: AnyArray) -> AnyArray:
-        array = np.asarray(actions)
+        array = as_array(actions)
         if array.shape != (self.num_envs,) or array.dtype.kind not in "iu":
             raise InputError(
                 f"action {_short(actions)} must be a whole number per environment, 0 up, 1 down, 2 left or 3 right"
@@ -187,7 +187,7 @@ class GridWorldEnv(NavigationEnv[GridWorldVectorEnv]):
 
     | observation | space |
     | --- | --- |
-    | ``cell_goal`` (default) | ``Discrete(cells x goals)``: cell * n_goals + goal, cells row by row, goals as in ``goal_cells`` |
+    | ``cell_goal`` (default) | ``Discrete(cells x goals)``: cell * n_goals + goal; goals as in ``goal_cells`` |
     | ``cell`` | ``Discrete(cells)``: the robot's cell alone, which does not say where the goal is |
     | ``features`` | ``Box``: the feature vector of the robot worlds, with the lidar at the cell's centre |
 

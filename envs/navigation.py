@@ -110,6 +110,7 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         self._last_action: FloatArray = np.zeros((n, 2))
         self._speed: FloatArray = np.zeros((n, 2))
         self._fixed: dict[str, Any] = {}
+        self._has_reset = False
 
         self.layout = Layout.load(layout)
         self._use_layout()
@@ -176,6 +177,7 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         self._fixed = fixed
         ids = np.arange(self.num_envs)
         self._begin(ids)
+        self._has_reset = True
         return self._observe(ids), self._info(_zero_terms(self.num_envs))
 
     def step(self, actions: AnyArray) -> tuple[AnyArray, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
@@ -183,7 +185,10 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
 
         Raises:
             InputError: When an action is not in the action space; nothing has changed then.
+            ResetNeeded: Before the first reset.
         """
+        if not self._has_reset:
+            raise gym.error.ResetNeeded("call reset() before the first step()")
         motion = self._drive(self._valid(actions))
 
         self._steps += 1
@@ -208,7 +213,7 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
                 at_goal=self._at_goal,
                 hit=motion.hit,
                 hit_inner_wall=motion.hit_inner_wall,
-                terminal=terminated,
+                terminal=self._at_goal | ends,  # not a failure of the physics: that must not pay
                 time_up=truncated,
             )
         )
@@ -413,6 +418,7 @@ class NavigationEnv(gym.Env[Any, Any], Generic[VectorWorld]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode; see ``NavigationVectorEnv.reset``."""
+        self.worlds._checked_options(options)  # before the seed changes anything
         super().reset(seed=seed)
         if self.spec is not None:
             # Gymnasium's TimeLimit keeps the time; the world needs to know it for rewards that look at it.
@@ -423,7 +429,7 @@ class NavigationEnv(gym.Env[Any, Any], Generic[VectorWorld]):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Drive for one step; see ``NavigationVectorEnv.step``."""
-        observations, rewards, terminated, truncated, info = self.worlds.step(_batch_of_one(action))
+        observations, rewards, terminated, truncated, info = self.worlds.step(as_array(action)[None])
         return _one(observations), float(rewards[0]), bool(terminated[0]), bool(truncated[0]), _one_info(info)
 
     def render(self) -> Any:
@@ -456,9 +462,10 @@ class NavigationEnv(gym.Env[Any, Any], Generic[VectorWorld]):
         return self.worlds.reward
 
 
-def _batch_of_one(action: Any) -> AnyArray:
+def as_array(action: Any) -> AnyArray:
+    """Actions as an array; InputError for what has no shape, such as rows of several lengths."""
     try:
-        return np.asarray(action)[None]
+        return np.asarray(action)
     except (ValueError, TypeError):
         raise InputError(f"action {action!r} is not an array of numbers") from None
 

@@ -11,7 +11,7 @@ from gymnasium.spaces import Box
 from gridnav.problem.geodesic import Geodesic
 from gridnav.problem.types import AnyArray, BoolArray, FloatArray, InputError, IntArray
 
-from .navigation import NavigationEnv, NavigationVectorEnv, VectorWorld
+from .navigation import NavigationEnv, NavigationVectorEnv, VectorWorld, as_array
 
 RELEASE_M = 0.01
 """A contact is over once the bumper is this far from the wall: until then it is counted and charged once."""
@@ -65,7 +65,7 @@ class RobotVectorEnv(NavigationVectorEnv):
         return arrived
 
     def _valid(self, actions: AnyArray) -> AnyArray:
-        array = np.asarray(actions)
+        array = as_array(actions)
         if array.shape != (self.num_envs, 2) or array.dtype.kind not in "fiu":
             raise InputError(
                 f"action of shape {array.shape} and type {array.dtype} must be two numbers per robot: forward and turn"

@@ -28,7 +28,7 @@ from gridnav.agents import Progress as Learning
 from gridnav.display.recording import ViewerError
 from gridnav.envs import RenderingError
 from gridnav.experiment.run_directory import RunDirectory, read_json, write_json
-from gridnav.experiment.training import BudgetName, OnStage, Problem, Result
+from gridnav.experiment.training import BUDGETS, BudgetName, OnStage, Problem, Result
 from gridnav.problem.layout import NAMED_LAYOUTS, Layout
 from gridnav.problem.reward import Reward
 from gridnav.problem.task import Task
@@ -36,9 +36,9 @@ from gridnav.problem.types import InputError
 
 Config = TypeVar("Config")
 stderr = Console(stderr=True, highlight=False, soft_wrap=True)
-stdout = Console(highlight=False, soft_wrap=True)
 TABLE_WIDTH = 132
 """Columns of the results where the output goes to a file or pipe."""
+stdout = Console(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else TABLE_WIDTH)
 
 
 # ---- The commands and their flags --------------------------------------------------------------
@@ -55,7 +55,7 @@ class _Run:
     task: str = "default"
     """Starts, goals and what a collision does: default, any or fragile."""
     reward: str = "default"
-    """default, or seed for the tutorial's."""
+    """default, fragile (for the task of that name) or seed (the tutorial's)."""
     seed: int = 0
     """Of everything that is random in training."""
     run_dir: Path | None = None
@@ -75,7 +75,7 @@ class Ladder(_Run):
         problem, config = self._problem()
         run = RunDirectory.create(self.run_dir, "ladder", {"command": "ladder", **config})
         with _progress() as on_stage:
-            results = climb(problem, self.budget, self.seed, run, _again(run), config, on_stage)
+            results = climb(problem, BUDGETS[self.budget], self.seed, run, _again(run), config, on_stage)
         _show(results, run)
         return 0
 
@@ -107,7 +107,7 @@ class Train(Ladder):
         run = RunDirectory.create(self.run_dir, f"train-{self.agent}", {"command": "train", **config})
         with _progress() as on_stage:
             result = train_and_report(
-                problem, self.budget, self.seed, self.agent, world, run, _again(run), config, on_stage
+                problem, BUDGETS[self.budget], self.seed, self.agent, world, run, _again(run), config, on_stage
             )
         _show([result], run)
         return 0
@@ -220,7 +220,7 @@ class LintReward:
     """Prove that avoiding the goal pays less than reaching it; exit code 1 where it does not."""
 
     reward: str = "default"
-    """default, or seed for the tutorial's."""
+    """default, fragile (for the task of that name) or seed (the tutorial's)."""
     layout: str = "classic"
     """A named layout, a text file, or a text."""
     task: str = "default"
@@ -241,13 +241,15 @@ class LintReward:
     def __call__(self) -> int:
         """Run it."""
         from gridnav.experiment.robot_lint import lint_robot
-        from gridnav.problem.lint import lint_grid, lint_idling
+        from gridnav.problem.lint import lint_crashing, lint_grid, lint_idling
 
         weights = {name: getattr(self, name) for name in asdict(Reward())}
         reward = replace(Reward.load(self.reward), **{k: v for k, v in weights.items() if v is not None})
         layout, task = Layout.load(self.layout), Task.load(self.task)
         stdout.print(f"{self.reward} on {layout.name}: {reward}")
         findings = [lint_grid(reward, layout, task), lint_idling(reward, layout, task)]
+        crashing = lint_crashing(reward, layout, task)
+        findings += [crashing] if crashing else []
         with stderr.status("driving scripted robots"):
             findings += lint_robot(reward, layout, task)
         for finding in findings:
@@ -329,10 +331,11 @@ def _parse(config: Callable[..., Config], name: str, words: list[str]) -> Config
     except SystemExit as leaving:
         if leaving.code != 2:
             raise
-    # The box holds a title, the error, and hints between rules: the error is what stands before the second rule.
+    # A box holds a title, the error and, behind a rule, hints; without a terminal a rule stands below the title too.
     lines = [line.strip(" ─│╭╮╰╯-") for line in problems.getvalue().splitlines()]
-    parts = re.split(r"\n\n+", "\n".join(lines))
-    message = " ".join(" ".join(parts[: 2 if len(parts) > 1 else 1]).split())
+    blocks = [block.splitlines() for block in re.split(r"\n\n+", "\n".join(lines).strip())]
+    error = blocks[0][1:] or blocks[1]
+    message = " ".join(" ".join(error).split())
     raise InputError(f"{message} (see 'gridnav {name} --help')")
 
 
@@ -374,28 +377,26 @@ def _again(run: RunDirectory) -> str:
 def _progress() -> Iterator[OnStage]:
     """A bar per training or evaluation, with the success rate."""
     columns = (
-        TextColumn("{task.description:<32}"),
-        BarColumn(bar_width=30),
-        TextColumn("{task.completed:>9,.0f}/{task.total:,.0f}"),
-        TextColumn("{task.fields[rate]:>9,.0f}/s"),
-        TextColumn("success {task.fields[success]}"),
+        TextColumn("{task.description:<28}"),
+        BarColumn(bar_width=20),
+        TextColumn("{task.fields[words]:<48}"),
         TimeElapsedColumn(),
     )
     with Progress(*columns, console=stderr) as bars:
 
         def on_stage(name: str) -> OnProgress:
-            task = bars.add_task(name, total=None, rate=0.0, success="  -  ")
+            for earlier in bars.task_ids:
+                bars.update(earlier, total=1, completed=1)
+                bars.stop_task(earlier)
+            task = bars.add_task(name, total=None, words="")
 
             def on_progress(learning: Learning) -> None:
                 success = learning.metrics.get("success_rate", float("nan"))
-                seconds = bars.tasks[task].elapsed or 1.0
-                bars.update(
-                    task,
-                    completed=learning.steps,
-                    total=max(learning.total_steps, learning.steps),
-                    rate=learning.steps / seconds,
-                    success="  -  " if success != success else f"{success:5.1%}",
-                )
+                rate = learning.steps / (bars.tasks[task].elapsed or 1.0)
+                words = f"{learning.steps:>9,}/{learning.total_steps:<9,} {rate:>9,.0f}/s"
+                if success == success:
+                    words += f"  success {success:6.1%}"
+                bars.update(task, completed=learning.steps, total=learning.total_steps, words=words)
 
             return on_progress
 
@@ -411,7 +412,11 @@ def _show(results: Sequence[Result], run: RunDirectory | None) -> None:
         success = f"{summary.success_rate:6.1%} ({low:.1%} to {high:.1%})"
         ratios = f"{summary.spl:.2f}", f"{summary.sct:.2f}", f"{summary.collision_rate:.1%}"
         table.add_row(result.name, result.world, result.agent, success, *ratios, time, f"{result.steps:,}")
-    stdout.print(table, width=None if stdout.is_terminal else TABLE_WIDTH)
+    stdout.print(table)
     if run is not None:
         stdout.print(f"report     {run.report}")
         stdout.print(f"recording  {run.recording}   (gridnav view {shlex.quote(str(run.path))})")
+
+
+if __name__ == "__main__":
+    main()

@@ -107,8 +107,10 @@ def _is_whole(checkpoint: Path) -> bool:
         parts: dict[str, dict[str, object]] = manifest["parts"]
         # Names come from a file: only plain ones inside the checkpoint are looked at.
         plain = all(name == Path(name).name for name in parts)
-        return manifest["format"] == FORMAT and plain and all(_digest(checkpoint / n) == d for n, d in parts.items())
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        named = isinstance(manifest["name"], str) and isinstance(manifest["kind"], str)
+        complete = manifest["format"] == FORMAT and set(Agent.files) <= parts.keys()
+        return plain and named and complete and all(_digest(checkpoint / n) == d for n, d in parts.items())
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return False
 
 

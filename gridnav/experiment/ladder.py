@@ -14,16 +14,19 @@ from gridnav.experiment.results import (
     write_rollout,
 )
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
-from gridnav.experiment.training import BUDGETS, BudgetName, OnStage, Problem, Result, Workshop
+from gridnav.experiment.training import Budget, OnStage, Problem, Result, Workshop
 
-QUESTION = "How far does a table learnt on the grid carry a wheeled robot, and what does a network save that starts on another?"
+QUESTION = (
+    "How far does a table learnt on the grid carry a wheeled robot, and what does a network save that "
+    "starts from another one?"
+)
 SOLVED = 0.95
 """The share of training episodes from which on a learner counts as there."""
 
 
 def climb(
     problem: Problem,
-    budget: BudgetName,
+    budget: Budget,
     seed: int,
     run: RunDirectory,
     command: str,
@@ -42,7 +45,7 @@ def climb(
         on_stage: Told of every training and evaluation.
     """
     with MetricsLog(run) as log:
-        workshop = Workshop(problem, BUDGETS[budget], seed, run, log, on_stage)
+        workshop = Workshop(problem, budget, seed, run, log, on_stage)
         plan = workshop.train("plan", "plan", "GridWorld")
         results = [workshop.evaluate("plan", plan, "GridWorld", "value iteration")]
 

@@ -16,7 +16,7 @@ from gridnav.display.report import Picture, Report, Rung, write_report
 from gridnav.experiment.checkpoint import load_agent
 from gridnav.experiment.evaluation import EVALUATION_SEED, evaluate, policy_for
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory, read_json, write_json
-from gridnav.experiment.training import BUDGETS, AgentKind, BudgetName, OnStage, Problem, Result, Workshop
+from gridnav.experiment.training import AgentKind, Budget, OnStage, Problem, Result, Workshop
 from gridnav.problem.geodesic import cell_distances
 
 DRAWN_EPISODES = 40
@@ -153,7 +153,7 @@ def write_page(
 
 def train_and_report(
     problem: Problem,
-    budget: BudgetName,
+    budget: Budget,
     seed: int,
     kind: AgentKind,
     world: str,
@@ -176,7 +176,7 @@ def train_and_report(
         on_stage: Told of the training and the evaluation.
     """
     with MetricsLog(run) as log:
-        workshop = Workshop(problem, BUDGETS[budget], seed, run, log, on_stage)
+        workshop = Workshop(problem, budget, seed, run, log, on_stage)
         trained = workshop.train(kind, kind, world)
         result = workshop.evaluate(kind, trained, world, kind)
         write_evaluation(run, [result], seed)

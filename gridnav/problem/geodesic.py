@@ -4,7 +4,8 @@ On the grid it is breadth-first search. For a robot it is the shortest way of a 
 (LaValle, *Planning Algorithms*, section 6.2.4): such a way runs straight from convex wall corner to
 convex wall corner, so it is found on the graph of corners that see each other. A corner is rounded by
 the disc's radius; three points stand for the arc, which is up to 2.3 % of the arc too long (4 mm at
-each right-angle turn of a 0.105 m robot) and never too short.
+each right-angle turn of a 0.105 m robot) and never too short, save half a millimetre for a robot that
+touches the corner.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from gridnav.problem.types import BoolArray, Cell, FloatArray, InputError, IntAr
 
 TOLERANCE_M = 1e-6
 """Slack of the clearance test: it keeps points that lie exactly one radius off a wall in sight."""
+ANCHOR_REACH = 1.0 / np.cos(np.pi / 12)
+"""Distance of the points around a corner, in radii: the chords between points 30 degrees apart clear the arc."""
 
 
 def cell_distances(layout: Layout, goal: Cell) -> FloatArray:
@@ -49,7 +52,9 @@ class Geodesic:
     """
 
     def __init__(self, layout: Layout, radius_m: float) -> None:
-        if not 0.0 <= radius_m < layout.cell_size_m / 2:
+        if not radius_m > TOLERANCE_M:
+            raise InputError(f"radius_m {radius_m} must be a positive number of metres")
+        if not radius_m < layout.cell_size_m / 2:
             raise InputError(
                 f"cell_size_m {layout.cell_size_m} is too small: a robot of radius {radius_m} m needs cells "
                 f"wider than {2 * radius_m} m"
@@ -146,7 +151,7 @@ def _anchors(layout: Layout, radius_m: float) -> FloatArray:
     """Points around every convex wall corner, a little more than one radius away, where the disc fits."""
     # The outer edge is a wall: it makes the corner points on it flat or concave, so they drop out.
     padded = np.pad(layout.walls, 1, constant_values=True)
-    reach = radius_m / np.cos(np.pi / 12)  # chords between points 30 degrees apart clear the arc
+    reach = radius_m * ANCHOR_REACH
     spread = np.array([-np.pi / 6, 0.0, np.pi / 6])
     points = []
     for row in range(1, layout.n_rows):
@@ -180,6 +185,9 @@ def _shortest(
     totals = np.empty(n_anchors + 1)
     for i in range(len(points)):
         x, y = points[i]
+        # A robot nearer to a wall than its radius may keep its distance. And where it touches a corner, it sees the
+        # points around only through a sliver of the corner's arc.
+        slim = min(radius, clearance(x, y, walls, cell)[0] / ANCHOR_REACH)
         goal = goals[goal_numbers[i]]
         cost = costs[goal_numbers[i]]
         for k in range(n_anchors):
@@ -191,7 +199,7 @@ def _shortest(
             if not np.isfinite(totals[k]):
                 break
             to_x, to_y = (goal[0], goal[1]) if k == n_anchors else (anchors[k, 0], anchors[k, 1])
-            if _sees(x, y, to_x, to_y, walls, cell, radius):
+            if _sees(x, y, to_x, to_y, walls, cell, slim):
                 out[i] = totals[k]
                 break
             totals[k] = np.inf
@@ -207,7 +215,8 @@ def _visible_from(point: FloatArray, others: FloatArray, walls: BoolArray, cell:
 
 @numba.njit(cache=True)
 def _sees(ax: float, ay: float, bx: float, by: float, walls: BoolArray, cell: float, radius: float) -> bool:
-    """Whether a disc can roll straight from a to b; where it starts nearer to a wall, it may not get nearer."""
+    """Whether a disc can roll straight from a to b."""
+    allowed = radius - TOLERANCE_M
     n_rows, n_cols = walls.shape
     low = max(int((min(ay, by) - radius) / cell), 0)
     high = min(int((max(ay, by) + radius) / cell), n_rows - 1)
@@ -224,7 +233,6 @@ def _sees(ax: float, ay: float, bx: float, by: float, walls: BoolArray, cell: fl
         for col in range(left, right + 1):
             if walls[n_rows - 1 - band, col]:
                 wx, wy = col * cell, band * cell
-                allowed = min(radius, _point_box(ax, ay, wx, wy, cell)) - TOLERANCE_M
                 if _segment_box(ax, ay, bx, by, wx, wy, cell) < allowed:
                     return False
     return True

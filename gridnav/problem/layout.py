@@ -96,8 +96,13 @@ class Layout:
     """True on the free cells that the starts reach, same shape as the walls."""
 
     def __post_init__(self) -> None:
-        for mask in (self.walls, self.starts, self.goals):
+        for name in ("walls", "starts", "goals"):
+            mask = np.array(getattr(self, name), dtype=np.bool_)  # a copy: who made it may go on writing to theirs
             mask.setflags(write=False)
+            object.__setattr__(self, name, mask)
+        shapes = {self.walls.shape, self.starts.shape, self.goals.shape}
+        if len(shapes) != 1 or self.walls.ndim != 2:
+            raise InputError(f"walls, starts and goals must have one shape (n_rows, n_cols), not {sorted(shapes)}")
         object.__setattr__(self, "start_cells", np.argwhere(self.starts))
         object.__setattr__(self, "goal_cells", np.argwhere(self.goals))
         self._validate()
@@ -332,13 +337,14 @@ class _UnreachableError(InputError):
         """The message in lines and columns of the text."""
         (row, col), (start_row, start_col) = self.cell, self.start
         return (
-            f"layout {name}, line {row + first_line}, column {col + 1}: this {self.what} cannot be reached from the "
-            f"start at line {start_row + first_line}, column {start_col + 1}; open a way or make it '#'"
+            f"layout {_short(name)}, line {row + first_line}, column {col + 1}: this {self.what} cannot be reached "
+            f"from the start at line {start_row + first_line}, column {start_col + 1}; open a way or make it '#'"
         )
 
 
 def _rows(text: str, name: str) -> tuple[list[str], int]:
     """The maze's lines and the number of the first, once each character and length is right."""
+    name = _short(name)
     lines = [line.rstrip() for line in text.splitlines()]
     filled = [number for number, line in enumerate(lines) if line]
     if not filled:
@@ -365,24 +371,31 @@ def _rows(text: str, name: str) -> tuple[list[str], int]:
 
 def _read(path: Path) -> str:
     """The text of a layout file, with one clear error for everything that can be wrong with it."""
+    shown = f"'{_short(str(path))}'"
     try:
         if not path.exists():
             known = ", ".join(NAMED_LAYOUTS)
-            raise InputError(f"unknown layout {str(path)!r}: it is no file, and the named layouts are {known}")
+            raise InputError(f"unknown layout {shown}: it is no file, and the named layouts are {known}")
         if not path.is_file():
-            raise InputError(f"layout {str(path)!r} is not a file: give a text file, or one of the named layouts")
+            raise InputError(f"layout {shown} is not a file: give a text file, or one of the named layouts")
         with path.open("rb") as file:
             content = file.read(MAX_FILE_BYTES + 1)
         if len(content) > MAX_FILE_BYTES:
-            raise InputError(f"layout {str(path)!r} is larger than {MAX_FILE_BYTES} bytes, the most a layout can need")
+            raise InputError(f"layout {shown} is larger than {MAX_FILE_BYTES} bytes, the most a layout can need")
         return content.decode("utf-8")
     except UnicodeDecodeError:
-        raise InputError(f"layout {str(path)!r} is not a text file: it must be UTF-8") from None
+        raise InputError(f"layout {shown} is not a text file: it must be UTF-8") from None
     except (OSError, ValueError) as error:
         if isinstance(error, InputError):
             raise
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise InputError(f"layout {str(path)[:60]!r} cannot be read: {reason}") from None
+        raise InputError(f"layout {shown} cannot be read: {reason}") from None
+
+
+def _short(text: str) -> str:
+    """The text fit for a message of one line: it may come from a hostile file name."""
+    text = text if text.isprintable() else repr(text)[1:-1]
+    return text if len(text) <= 100 else f"{text[:37]}...{text[-60:]}"
 
 
 def _check_size(n_rows: int, n_cols: int) -> None:

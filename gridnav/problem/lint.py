@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gridnav.problem.geodesic import cell_distances
-from gridnav.problem.grid_mdp import GridMDP
+from gridnav.problem.grid_mdp import GridMDP, MoveTable
 from gridnav.problem.layout import Layout
 from gridnav.problem.reward import Reward, Transition, total
 from gridnav.problem.task import Task
@@ -126,6 +126,30 @@ def lint_idling(reward: Reward, layout: Layout, task: Task) -> Finding:
             best = Finding("all worlds", "standing still for one cell-time", cell, goal, float(earned[i]), 0.0)
     assert best is not None, "a layout has at least one goal"
     return best
+
+
+def lint_crashing(reward: Reward, layout: Layout, task: Task) -> Finding | None:
+    """Whether a collision that ends the episode pays at once; none where the task lets episodes go on.
+
+    There the potential drops to 0, which pays ``progress*D``. Over a whole episode every end is paid the same, but a
+    learner that sees a fraction of the way ahead would crash for it.
+
+    Returns:
+        The cell and goal where crashing earns most at once; sane when it costs there.
+    """
+    if task.on_collision != "end":
+        return None
+    worst: Finding | None = None
+    for goal in map(tuple, task.goal_cells(layout).tolist()):
+        mdp = GridMDP.of(layout, goal, reward, task)
+        crashes = MoveTable.of(layout).hit & layout.reachable.ravel()[:, None]
+        crashes[goal[0] * layout.n_cols + goal[1]] = False
+        earned = np.where(crashes, mdp.reward, -np.inf).max(axis=1)
+        cell = int(earned.argmax())
+        if worst is None or earned[cell] > worst.avoiding_return:
+            at = (cell // layout.n_cols, cell % layout.n_cols)
+            worst = Finding("all worlds", "ending the episode by a collision", at, goal, float(earned[cell]), 0.0)
+    return worst
 
 
 def _loop(mdp: GridMDP, policy: np.ndarray, start: int, n_cols: int) -> str:

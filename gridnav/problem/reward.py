@@ -52,43 +52,47 @@ class Reward:
     """Weights of the reward's terms; the class is the default reward itself.
 
     Idling must not pay: standing still at distance D earns ``progress*D*(1 - gamma)`` and costs ``time_cost`` per
-    cell-time, so the time cost has to exceed the former for every D of the layout (50 cells with the defaults).
-    ``gridnav lint-reward`` checks it.
+    cell-time, so the time cost has to exceed the former for every D of the layout (up to 66 cells with the defaults).
+    Where a collision ends the episode, its cost must outweigh ``progress*D``, which the vanishing potential pays there:
+    the preset ``fragile`` is for such tasks. ``gridnav lint-reward`` checks both.
     """
 
     goal: float = 10.0
     """Paid once at the goal."""
-    collision_cost: float = 2.0
-    """Charged for every step with a collision."""
+    collision_cost: float = 1.0
+    """Charged for every collision."""
     distance_cost: float = 0.05
     """Charged per cell travelled."""
-    time_cost: float = 0.25
+    time_cost: float = 0.2
     """Charged per cell-time."""
-    progress: float = 0.5
+    progress: float = 1.0
     """Weight of the potential-based progress, reward per cell."""
-    gamma: float = 0.99
+    gamma: float = 0.997
     """Discount per cell-time, in (0, 1]; learners that follow it discount a step by ``gamma**dt``."""
 
-    PRESETS: ClassVar[dict[str, type[Reward]]] = {}
+    PRESETS: ClassVar[dict[str, Reward]] = {}
 
     def __post_init__(self) -> None:
         for item in fields(self):
             value = getattr(self, item.name)
             if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-                raise InputError(f"reward {item.name} {value!r} must be a finite number")
+                raise InputError(f"reward {item.name} {value!r:.60} must be a finite number")
         if not 0.0 < self.gamma <= 1.0:
             raise InputError(f"reward gamma {self.gamma} is outside (0, 1]: it is the discount per cell-time")
 
     @classmethod
     def preset(cls, name: str) -> Reward:
-        """The named reward: ``default``, or ``seed``, the tutorial's reward of the 10 x 10 grid.
+        """The named reward.
+
+        ``default``; ``fragile`` for tasks where a collision ends the episode; ``seed``, the tutorial's reward of the
+        10 x 10 grid.
 
         Raises:
             InputError: When no preset has that name.
         """
         if not isinstance(name, str) or name not in cls.PRESETS:
-            raise InputError(f"unknown reward {name!r}: the presets are {', '.join(cls.PRESETS)}")
-        return cls.PRESETS[name]()
+            raise InputError(f"unknown reward {name!r:.60}: the presets are {', '.join(cls.PRESETS)}")
+        return cls.PRESETS[name]
 
     @classmethod
     def load(cls, source: str | Reward) -> Reward:
@@ -174,4 +178,4 @@ class TutorialReward(Reward):
         return np.zeros_like(distance)
 
 
-Reward.PRESETS.update(default=Reward, seed=TutorialReward)
+Reward.PRESETS.update(default=Reward(), fragile=Reward(collision_cost=70.0), seed=TutorialReward())

@@ -38,7 +38,7 @@ class Task:
         allowed = {"starts": ("layout", "any"), "goals": ("layout", "any"), "on_collision": ("stop", "slide", "end")}
         for name, values in allowed.items():
             if getattr(self, name) not in values:
-                raise InputError(f"task {name} {getattr(self, name)!r} is none of {', '.join(values)}")
+                raise InputError(f"task {name} {getattr(self, name)!r:.60} is none of {', '.join(values)}")
         if not 0 < self.goal_radius_m < np.inf:
             raise InputError(f"task goal_radius_m {self.goal_radius_m} must be a positive number of metres")
 
@@ -52,7 +52,7 @@ class Task:
         if isinstance(source, Task):
             return source
         if not isinstance(source, str) or source not in NAMED_TASKS:
-            raise InputError(f"unknown task {source!r}: the named tasks are {', '.join(NAMED_TASKS)}")
+            raise InputError(f"unknown task {source!r:.60}: the named tasks are {', '.join(NAMED_TASKS)}")
         return NAMED_TASKS[source]
 
     def start_cells(self, layout: Layout) -> IntArray:
