@@ -15,7 +15,7 @@ from gridnav.problem.types import AnyArray, BoolArray, FloatArray, InputError, I
 from . import gl
 from .mjcf import build_model
 from .navigation import Motion
-from .robot_world import RELEASE_M, RobotEnv, RobotVectorEnv, towards
+from .robot_world import RELEASE_M, SAME_WALL, RobotEnv, RobotVectorEnv, towards
 
 BUMPER_PERIOD_S = 0.05
 """The bumper is looked at this often: the Burger publishes its sensors at 20 Hz."""
@@ -98,16 +98,17 @@ class DiffDriveVectorEnv(RobotVectorEnv):
         with np.errstate(invalid="ignore", over="ignore"):  # a robot whose physics diverges is dealt with below
             for n_substeps in self._looks:
                 into = towards(direction, _headings(self._qpos), forward)
-                refused = stops & self._in_contact & into & (gap < self.robot.radius_m + CONTACT_MARGIN_M)
+                refused = stops & self._knows(direction) & into & (gap < self.robot.radius_m + CONTACT_MARGIN_M)
                 allowed = wheels - np.where(refused, forward, 0.0)[:, None]
                 self._ctrl[:] = allowed * self.robot.max_wheel_speed_rad_s
                 self._batch.step(nstep=n_substeps)
                 gap, direction, inner = clearances(self._qpos[:, :2], self.layout)
                 touches = (gap < self.robot.radius_m) & towards(direction, _headings(self._qpos), forward)
-                begins = touches & ~self._in_contact if stops else touches
+                begins = touches & ~self._knows(direction) if stops else touches
                 hit |= begins
                 hit_inner |= begins & inner
-                self._in_contact = (self._in_contact | touches) & (gap < self.robot.radius_m + RELEASE_M)
+                self._contact[touches] = direction[touches]
+                self._contact[gap > self.robot.radius_m + RELEASE_M] = 0.0
                 travelled += np.hypot(*(self._qpos[:, :2] - position).T)
                 position[:] = self._qpos[:, :2]
         failed = self._diverged()
@@ -119,6 +120,11 @@ class DiffDriveVectorEnv(RobotVectorEnv):
         self._sense()
         self._last_action = actions
         return Motion(travelled, hit, hit_inner, failed)
+
+    def _knows(self, direction: FloatArray) -> BoolArray:
+        """Whether the nearest wall is the one that the bumper already met."""
+        known: BoolArray = (self._contact * direction).sum(axis=1) > SAME_WALL
+        return known
 
     def _sense(self) -> None:
         heading = _headings(self._qpos)
@@ -171,7 +177,7 @@ class DiffDriveEnv(RobotEnv[DiffDriveVectorEnv]):
     ## Action space
 
     ``Box(-1, 1, (2,))``: forward and turning speed as fractions of the robot's maxima (0.197 m/s and 2.46 rad/s, the
-    motors' no-load speeds; friction takes about 8 % at full speed). The command is held for one control period.
+    motors' no-load speeds; friction takes about 9 % at full speed). The command is held for one control period.
 
     ## Observation space
 

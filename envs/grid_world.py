@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode
 
 from gridnav.problem.geodesic import cell_distances
 from gridnav.problem.grid_mdp import MOVE_HEADINGS_RAD, SIDEWAYS, MoveTable
+from gridnav.problem.layout import Layout
 from gridnav.problem.types import AnyArray, BoolArray, FloatArray, InputError, IntArray
 
 from .navigation import Motion, NavigationEnv, NavigationVectorEnv, as_array
@@ -70,9 +71,9 @@ class GridWorldVectorEnv(NavigationVectorEnv):
     def _numbers(self, cells: IntArray) -> IntArray:
         return cells[..., 0] * self.layout.n_cols + cells[..., 1]
 
-    def _checked_options(self, options: dict[str, Any] | None) -> Any:
+    def _checked_options(self, options: dict[str, Any] | None) -> tuple[dict[str, Any], Layout]:
         fixed, layout = super()._checked_options(options)
-        goals = self.task.goal_cells(layout or self.layout)
+        goals = self.task.goal_cells(layout)
         if self.observation == "cell_goal":
             if "goal" in fixed and not (goals == fixed["goal"]).all(axis=1).any():
                 raise InputError(

@@ -6,6 +6,7 @@ a ``NavigationEnv`` around the same world with a batch of one, so that scalar an
 
 from __future__ import annotations
 
+import inspect
 import numbers
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -85,6 +86,8 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
     ) -> None:
         if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
             raise InputError(f"num_envs {num_envs!r} must be a whole number of at least 1")
+        if max_episode_steps == -1:  # Gymnasium's word for no limit
+            max_episode_steps = None
         if max_episode_steps is not None and max_episode_steps < 1:
             raise InputError(f"max_episode_steps {max_episode_steps} must be at least 1")
         modes = self.metadata["render_modes"]
@@ -112,7 +115,7 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         self._fixed: dict[str, Any] = {}
         self._has_reset = False
 
-        self.layout = Layout.load(layout)
+        self.layout = self._own_layout = Layout.load(layout)
         self._use_layout()
         self.single_observation_space, self.single_action_space = self._spaces()
         self.observation_space = batch_space(self.single_observation_space, n)
@@ -171,7 +174,7 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         fixed, layout = self._checked_options(options)
         if seed is not None:
             self.use_generators(self._generators(seed))
-        if layout is not None and layout != self.layout:
+        if layout != self.layout:
             self.layout = layout
             self._use_layout()
         self._fixed = fixed
@@ -336,32 +339,33 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
 
     # ---- Options and seeds -------------------------------------------------------------------
 
-    def _checked_options(self, options: dict[str, Any] | None) -> tuple[dict[str, Any], Layout | None]:
-        """The options that fix a start state, and the new layout if one is asked for; InputError otherwise."""
+    def _checked_options(self, options: dict[str, Any] | None) -> tuple[dict[str, Any], Layout]:
+        """The options that fix a start state, and the layout to play; InputError otherwise."""
         options = dict(options or {})
         for key in options:
             if key not in OPTIONS:
                 raise InputError(f"unknown reset option {key!r}: the options are {', '.join(OPTIONS)}")
-        layout = None
+        layout = own = self._own_layout
         if options.get("layout") is not None:
-            layout = Layout.load(options["layout"], cell_size_m=self.layout.cell_size_m)
-            if layout.walls.shape != self.layout.walls.shape or layout.cell_size_m != self.layout.cell_size_m:
+            layout = Layout.load(options["layout"], cell_size_m=own.cell_size_m)
+            if layout.walls.shape != own.walls.shape or layout.cell_size_m != own.cell_size_m:
                 raise InputError(
                     f"reset option layout has {layout.n_rows} x {layout.n_cols} cells of {layout.cell_size_m} m, the "
-                    f"environment {self.layout.n_rows} x {self.layout.n_cols} of {self.layout.cell_size_m} m: make a "
-                    "new environment for another size"
+                    f"environment {own.n_rows} x {own.n_cols} of {own.cell_size_m} m: make a new environment for "
+                    "another size"
                 )
         fixed: dict[str, Any] = {}
         for key in ("start", "goal"):
             if options.get(key) is not None:
-                fixed[key] = np.array(_free_cell(options[key], key, layout or self.layout))
+                fixed[key] = np.array(_free_cell(options[key], key, layout))
         if "start" in fixed and "goal" in fixed and (fixed["start"] == fixed["goal"]).all():
             raise InputError(f"reset options start and goal are both {options['start']}: they must differ")
         heading = options.get("heading_rad")
         if heading is not None:
             if isinstance(heading, bool) or not isinstance(heading, numbers.Real) or not np.isfinite(float(heading)):
                 raise InputError(f"reset option heading_rad {heading!r} must be a finite number of radians")
-            fixed["heading_rad"] = float(heading)
+            turned = float(heading)
+            fixed["heading_rad"] = turned if abs(turned) <= np.pi else (turned + np.pi) % (2 * np.pi) - np.pi
         return fixed, layout
 
     def use_generators(self, generators: list[np.random.Generator]) -> None:
@@ -420,9 +424,9 @@ class NavigationEnv(gym.Env[Any, Any], Generic[VectorWorld]):
         """Start an episode; see ``NavigationVectorEnv.reset``."""
         self.worlds._checked_options(options)  # before the seed changes anything
         super().reset(seed=seed)
-        if self.spec is not None:
-            # Gymnasium's TimeLimit keeps the time; the world needs to know it for rewards that look at it.
-            self.worlds.max_episode_steps = self.spec.max_episode_steps
+        limit = _time_limit_around(self)
+        if limit is not None:
+            self.worlds.max_episode_steps = limit
         self.worlds.use_generators([self.np_random])
         observations, info = self.worlds.reset(options=options)
         return _one(observations), _one_info(info)
@@ -460,6 +464,21 @@ class NavigationEnv(gym.Env[Any, Any], Generic[VectorWorld]):
     def reward(self) -> Reward:
         """The reward."""
         return self.worlds.reward
+
+
+def _time_limit_around(env: gym.Env[Any, Any]) -> int | None:
+    """The limit of Gymnasium's ``TimeLimit`` around an environment that is being reset, or none.
+
+    ``gym.make`` keeps the limit to the wrapper and tells the environment nothing, but a reward may look at the last
+    move. The wrapper is found where it stands: among the callers of ``reset``.
+    """
+    frame = inspect.currentframe()
+    while frame is not None:
+        caller = frame.f_locals.get("self")
+        if isinstance(caller, gym.wrappers.TimeLimit) and caller.unwrapped is env:
+            return caller._max_episode_steps
+        frame = frame.f_back
+    return None
 
 
 def as_array(action: Any) -> AnyArray:

@@ -15,6 +15,8 @@ from .navigation import NavigationEnv, NavigationVectorEnv, VectorWorld, as_arra
 
 RELEASE_M = 0.01
 """A contact is over once the bumper is this far from the wall: until then it is counted and charged once."""
+SAME_WALL = 0.7
+"""Cosine of the angle up to which two directions of contact mean one wall: another wall is another collision."""
 
 
 class RobotVectorEnv(NavigationVectorEnv):
@@ -48,13 +50,14 @@ class RobotVectorEnv(NavigationVectorEnv):
         super()._use_layout()
         self._geodesic = Geodesic(self.layout, self.robot.radius_m)
         self._goal_number = np.zeros(self.num_envs, dtype=np.int64)
-        self._in_contact = np.zeros(self.num_envs, dtype=bool)
+        # Direction of the wall that the bumper met last and has not left, zero without one.
+        self._contact: FloatArray = np.zeros((self.num_envs, 2))
 
     def _place(self, ids: IntArray) -> None:
         for i in ids:
             row, col = self._goal[i].tolist()
             self._goal_number[i] = self._geodesic.goal_number((row, col))
-        self._in_contact[ids] = False
+        self._contact[ids] = 0.0
 
     def _distances(self, ids: IntArray | slice) -> FloatArray:
         return self._geodesic.distances(self._pose[ids, :2], self._goal_number[ids]) / self.layout.cell_size_m

@@ -13,7 +13,7 @@ from gridnav.problem.types import AnyArray, BoolArray, FloatArray
 
 from .navigation import Motion
 from .painter import Painter
-from .robot_world import RELEASE_M, RobotEnv, RobotVectorEnv
+from .robot_world import RELEASE_M, SAME_WALL, RobotEnv, RobotVectorEnv
 
 SUBSTEP_S = 0.01
 """Where a wall is near, contact is looked for this often: a robot at full speed moves 2 mm in it."""
@@ -48,7 +48,7 @@ class UnicycleVectorEnv(RobotVectorEnv):
             self.task.on_collision == "slide",
             self.layout.walls,
             self.layout.cell_size_m,
-            self._in_contact,
+            self._contact,
             travelled,
             hit,
             inner,
@@ -117,7 +117,8 @@ class UnicycleEnv(RobotEnv[UnicycleVectorEnv]):
         super().__init__(UnicycleVectorEnv(1, autoreset=False, **shared))
 
 
-@numba.njit(cache=True)
+# Not cached on disk: numba would not notice a change of `clearance`, which it compiles in from another file.
+@numba.njit(cache=False)
 def _roll(
     poses: FloatArray,
     speeds: FloatArray,
@@ -127,7 +128,7 @@ def _roll(
     slides: bool,
     walls: BoolArray,
     cell: float,
-    in_contact: BoolArray,
+    contact: FloatArray,
     travelled: FloatArray,
     hits: BoolArray,
     inner_hits: BoolArray,
@@ -149,17 +150,17 @@ def _roll(
             way = abs(speed) * dt
             gap, ux, uy, inner = clearance(to_x, to_y, walls, cell)
             if gap < radius and (to_x - x) * ux + (to_y - y) * uy > 0.0:
-                if slides or not in_contact[i]:
+                if slides or contact[i, 0] * ux + contact[i, 1] * uy <= SAME_WALL:
                     hits[i] = True
                     inner_hits[i] = inner_hits[i] or inner
-                in_contact[i] = True
+                contact[i, 0], contact[i, 1] = ux, uy
                 if slides:
                     to_x, to_y = to_x + ux * (gap - radius), to_y + uy * (gap - radius)
                 if not slides or clearance(to_x, to_y, walls, cell)[0] < radius - 1e-6:  # a second wall
                     to_x, to_y = x, y
                 way = np.hypot(to_x - x, to_y - y)
             elif gap > radius + RELEASE_M:
-                in_contact[i] = False
+                contact[i, 0] = contact[i, 1] = 0.0
             travelled[i] += way
             x, y, heading = to_x, to_y, heading + turned
         poses[i, 0], poses[i, 1], poses[i, 2] = x, y, heading

@@ -81,9 +81,7 @@ def test_a_wrong_config_file_is_refused(
     assert [path.name for path in in_empty_folder.iterdir()] == ["config.json"]
 
 
-def test_a_run_directory_in_use_is_never_overwritten(
-    in_empty_folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_directory_in_use_is_never_overwritten(in_empty_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     Path("mine").mkdir()
     Path("mine/thesis.txt").write_text("years of work", encoding="utf-8")
 

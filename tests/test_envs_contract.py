@@ -720,19 +720,7 @@ def test_the_default_time_limit_holds_in_both_forms(env_id: str) -> None:
     assert ends == [[limit], [limit]]
 
 
-@pytest.mark.parametrize(
-    "through",
-    [
-        "class",
-        pytest.param(
-            "make",
-            marks=pytest.mark.xfail(
-                reason="gym.make keeps max_episode_steps in its TimeLimit and hides it from the environment",
-                strict=True,
-            ),
-        ),
-    ],
-)
+@pytest.mark.parametrize("through", ["class", "make"])
 def test_rewards_that_look_at_the_time_limit_see_the_same_one_in_both_forms(env_id: str, through: str) -> None:
     """The tutorial's reward charges 1 for the move that ends the time."""
     arguments: dict[str, Any] = {"reward": "seed", "max_episode_steps": 4}

@@ -32,9 +32,7 @@ def quiet(name: str) -> Callable[[Progress], None]:
 
 
 @pytest.mark.parametrize("world", ["GridWorld", "Unicycle", "DiffDrive"])
-def test_a_plan_of_the_grid_reaches_every_goal_in_every_world_without_a_collision(
-    world: str, planner: Planner
-) -> None:
+def test_a_plan_of_the_grid_reaches_every_goal_in_every_world_without_a_collision(world: str, planner: Planner) -> None:
     worlds = make_worlds(world, 50)
 
     summary = summarise(evaluate(policy_for(planner, worlds), worlds))
