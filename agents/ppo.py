@@ -46,15 +46,18 @@ class PPOConfig:
     """Discount per control period."""
     gae_lambda: float = 0.95
     """Decay of the generalised advantage estimate."""
-    ent_coef: float = 0.003
+    ent_coef: float = 0.0
     """Weight of the entropy bonus."""
     log_std_init: float = -0.5
     """Logarithm of the policy's first standard deviation, as fraction of full speed."""
-    hidden: tuple[int, ...] = (64, 64)
+    log_std_final: float = -1.5
+    """In the second half of the planned steps its upper bound falls linearly to this, so that what is trained is what
+    acts greedily."""
+    hidden: tuple[int, ...] = (128, 128)
     """Units of the hidden layers (tanh) of policy and value network."""
     reward_scale: float = 1.0
     """Factor on the rewards the learner sees: it keeps the value network's gradient from crowding out the policy's."""
-    target_success: float | None = 0.99
+    target_success: float | None = None
     """Training stops once this share of the last 400 episodes arrived; never before its steps are used up if none."""
 
 
@@ -110,7 +113,7 @@ class PPOAgent(Agent):
         model.policy.load_state_dict(self.policy.state_dict())
         model.set_logger(Logger(folder=None, output_formats=[]))
         try:
-            model.learn(steps, callback=_Reporter(adapter, steps, config.target_success, on_progress))
+            model.learn(steps, callback=_Reporter(adapter, steps, config, on_progress))
         finally:
             # What was learnt before an interrupt counts too.
             self.policy.load_state_dict(model.policy.state_dict())
@@ -201,21 +204,35 @@ _NOTHING: dict[str, Any] = {}
 
 
 class _Reporter(BaseCallback):
-    """Reports after every rollout and stops at the success that is asked for."""
+    """Between rollouts: reports, narrows exploration, and stops at the success that is asked for."""
 
     def __init__(
-        self, adapter: Sb3VecEnv, total_steps: int, target_success: float | None, on_progress: OnProgress | None
+        self, adapter: Sb3VecEnv, total_steps: int, config: PPOConfig, on_progress: OnProgress | None
     ) -> None:
         super().__init__()
         self._window = adapter.window
-        self._total_steps, self._target, self._on_progress = total_steps, target_success, on_progress
+        self._total_steps, self._config, self._on_progress = total_steps, config, on_progress
 
     def _on_step(self) -> bool:
-        if self._target is None or not self._window.is_full:
+        target = self._config.target_success
+        if target is None or not self._window.is_full:
             return True
-        return self._window.metrics["success_rate"] < self._target
+        return self._window.metrics["success_rate"] < target
 
     def _on_rollout_start(self) -> None:
+        self._cap_exploration()
+        self._report()
+
+    def _cap_exploration(self) -> None:
+        first, last = self._config.log_std_init, self._config.log_std_final
+        share = min(1.0, max(0.0, 2.0 * self.num_timesteps / self._total_steps - 1.0))
+        cap = first + (last - first) * share
+        log_std = self.model.policy.log_std
+        assert isinstance(log_std, torch.Tensor)
+        with torch.no_grad():
+            log_std.clamp_(max=cap)
+
+    def _report(self) -> None:
         if self._on_progress is None or self.num_timesteps == 0:
             return
         values = self.logger.name_to_value
@@ -227,4 +244,4 @@ class _Reporter(BaseCallback):
         self._on_progress(Progress(self.num_timesteps, self._total_steps, metrics))
 
     def _on_training_end(self) -> None:
-        self._on_rollout_start()
+        self._report()

@@ -817,3 +817,31 @@ def test_documented_numbers_are_those_of_the_code(env_id: str) -> None:
         assert f"{robot.max_speed_m_s:.3f} m/s and {robot.max_turn_rad_s:.2f} rad/s" in page
         assert f"{world.control_period_s} s is {world.step_duration:.3f} cell-times" in page
         assert f"within {world.task.goal_radius_m} m" in page
+
+
+@pytest.mark.parametrize("robot_id", ROBOTS)
+def test_two_walls_of_a_corner_are_two_collisions(robot_id: str) -> None:
+    """From the top right cell: 0.145 m to the right wall, then along it as far to the top wall."""
+    env = gym.make(robot_id)
+    env.reset(seed=0, options={"start": (0, 9), "goal": (9, 9), "heading_rad": 0.0})
+
+    counts = []
+    for command, n_steps in (([1.0, 0.0], 8), ([0.0, 0.32], 10), ([1.0, 0.0], 8)):
+        for _ in range(n_steps):
+            _, _, _, _, info = env.step(command)
+        counts.append(info["collisions"])
+
+    # 10 steps of 0.2 s at 0.32 * 2.46 rad/s make 1.57 rad: a quarter turn to the left.
+    assert counts == [1, 1, 2]
+
+
+@pytest.mark.parametrize("as_vector", [False, True])
+def test_a_layout_option_holds_until_the_next_reset(env_id: str, as_vector: bool) -> None:
+    env = gym.make_vec(env_id, num_envs=2) if as_vector else gym.make(env_id)
+    classic = env.unwrapped.layout
+    other = Layout.from_text(classic.to_text().replace("#", "."))
+
+    env.reset(seed=0, options={"layout": other})
+    assert env.unwrapped.layout == other
+    env.reset(seed=0)
+    assert env.unwrapped.layout == classic

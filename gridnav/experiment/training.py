@@ -29,15 +29,15 @@ class Budget:
     q_learning_steps: int
     """Environment steps of tabular Q-learning."""
     ppo_steps: int
-    """Most environment steps of one PPO training; it stops earlier once it succeeds."""
+    """Environment steps of one PPO training."""
     episodes: int
     """Evaluation episodes per rung."""
 
 
 BUDGETS: dict[str, Budget] = {
     "quick": Budget(q_learning_steps=600_000, ppo_steps=120_000, episodes=50),
-    "default": Budget(q_learning_steps=600_000, ppo_steps=1_500_000, episodes=200),
-    "full": Budget(q_learning_steps=2_000_000, ppo_steps=5_000_000, episodes=1000),
+    "default": Budget(q_learning_steps=600_000, ppo_steps=650_000, episodes=200),
+    "full": Budget(q_learning_steps=2_000_000, ppo_steps=2_000_000, episodes=1000),
 }
 
 

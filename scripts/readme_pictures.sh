@@ -1,0 +1,11 @@
+#!/usr/bin/env bash
+# Makes the pictures of the README from a real run: a full ladder, about six minutes on two cores.
+# Needs a Vulkan driver (apt-get install mesa-vulkan-drivers) for the recording's picture.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+run=$(mktemp -d)/ladder
+python3 start.py ladder --run-dir "$run" --seed 0
+mkdir -p docs
+python3 start.py view "$run" --screenshot docs/ladder.png
+cp "$run/figures/learning.png" "$run/figures/trajectories.png" docs/
