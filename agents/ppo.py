@@ -206,9 +206,7 @@ _NOTHING: dict[str, Any] = {}
 class _Reporter(BaseCallback):
     """Between rollouts: reports, narrows exploration, and stops at the success that is asked for."""
 
-    def __init__(
-        self, adapter: Sb3VecEnv, total_steps: int, config: PPOConfig, on_progress: OnProgress | None
-    ) -> None:
+    def __init__(self, adapter: Sb3VecEnv, total_steps: int, config: PPOConfig, on_progress: OnProgress | None) -> None:
         super().__init__()
         self._window = adapter.window
         self._total_steps, self._config, self._on_progress = total_steps, config, on_progress

@@ -92,22 +92,22 @@ class DiffDriveVectorEnv(RobotVectorEnv):
         wheels = self.robot.wheel_fractions(actions)
         forward = wheels.mean(axis=1)
         n, stops = self.num_envs, self.task.on_collision != "slide"
-        travelled, hit, hit_inner = np.zeros(n), np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+        travelled = np.zeros(n)
+        begins, refused = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
         position = self._qpos[:, :2].copy()
         gap, direction, inner = clearances(position, self.layout)
         with np.errstate(invalid="ignore", over="ignore"):  # a robot whose physics diverges is dealt with below
             for n_substeps in self._looks:
                 into = towards(direction, _headings(self._qpos), forward)
-                refused = stops & self._knows(direction) & into & (gap < self.robot.radius_m + CONTACT_MARGIN_M)
-                allowed = wheels - np.where(refused, forward, 0.0)[:, None]
+                refuse = stops & self._knows(direction) & into & (gap < self.robot.radius_m + CONTACT_MARGIN_M)
+                refused |= refuse
+                allowed = wheels - np.where(refuse, forward, 0.0)[:, None]
                 self._ctrl[:] = allowed * self.robot.max_wheel_speed_rad_s
                 self._batch.step(nstep=n_substeps)
                 gap, direction, inner = clearances(self._qpos[:, :2], self.layout)
                 touches = (gap < self.robot.radius_m) & towards(direction, _headings(self._qpos), forward)
-                begins = touches & ~self._knows(direction) if stops else touches
-                hit |= begins
-                hit_inner |= begins & inner
-                self._contact[touches] = direction[touches]
+                begins |= touches & ~self._knows(direction) if stops else touches
+                self._contact[touches], self._contact_is_inner[touches] = direction[touches], inner[touches]
                 self._contact[gap > self.robot.radius_m + RELEASE_M] = 0.0
                 travelled += np.hypot(*(self._qpos[:, :2] - position).T)
                 position[:] = self._qpos[:, :2]
@@ -115,11 +115,9 @@ class DiffDriveVectorEnv(RobotVectorEnv):
         if failed.any():
             # Back to the last good pose, so that what is observed stays finite.
             self._rest(np.flatnonzero(failed))
-            travelled[failed] = 0.0
-            hit, hit_inner = hit & ~failed, hit_inner & ~failed
         self._sense()
         self._last_action = actions
-        return Motion(travelled, hit, hit_inner, failed)
+        return self._motion(travelled, begins, refused, failed)
 
     def _knows(self, direction: FloatArray) -> BoolArray:
         """Whether the nearest wall is the one that the bumper already met."""

@@ -11,7 +11,7 @@ from gymnasium.spaces import Box
 from gridnav.problem.geodesic import Geodesic
 from gridnav.problem.types import AnyArray, BoolArray, FloatArray, InputError, IntArray
 
-from .navigation import NavigationEnv, NavigationVectorEnv, VectorWorld, as_array
+from .navigation import Motion, NavigationEnv, NavigationVectorEnv, VectorWorld, as_array
 
 RELEASE_M = 0.01
 """A contact is over once the bumper is this far from the wall: until then it is counted and charged once."""
@@ -23,8 +23,8 @@ class RobotVectorEnv(NavigationVectorEnv):
     """``num_envs`` robots that take a forward and a turning command per control period.
 
     A robot whose bumper meets a wall is stopped: it can turn and back off, and commands into the wall are refused. The
-    contact is counted and charged once. Where the task lets robots slide, nothing is refused and every period with a
-    contact is charged.
+    contact is counted once, and again for every cell-time that the robot keeps pressing, as the grid counts every bump.
+    Where the task lets robots slide, nothing is refused and every period with a contact is charged.
 
     Args:
         num_envs: Robots in the batch.
@@ -52,12 +52,30 @@ class RobotVectorEnv(NavigationVectorEnv):
         self._goal_number = np.zeros(self.num_envs, dtype=np.int64)
         # Direction of the wall that the bumper met last and has not left, zero without one.
         self._contact: FloatArray = np.zeros((self.num_envs, 2))
+        self._contact_is_inner = np.zeros(self.num_envs, dtype=bool)
+        self._pressed_s: FloatArray = np.zeros(self.num_envs)
 
     def _place(self, ids: IntArray) -> None:
         for i in ids:
             row, col = self._goal[i].tolist()
             self._goal_number[i] = self._geodesic.goal_number((row, col))
         self._contact[ids] = 0.0
+        self._pressed_s[ids] = 0.0
+
+    def _motion(self, travelled: FloatArray, begins: BoolArray, refused: BoolArray, failed: BoolArray) -> Motion:
+        """What a period did, with another collision for every cell-time of pressing against a wall.
+
+        Args:
+            travelled: Metres, shape ``(n,)``.
+            begins: A contact began (or, sliding, went on), shape ``(n,)``.
+            refused: A command into the wall was refused, shape ``(n,)``.
+            failed: The physics diverged, shape ``(n,)``.
+        """
+        self._pressed_s = np.where(refused & ~begins, self._pressed_s + self.control_period_s, 0.0)
+        again = self._pressed_s >= self.layout.cell_size_m / self.robot.max_speed_m_s
+        self._pressed_s[again] = 0.0
+        hit = (begins | again) & ~failed
+        return Motion(np.where(failed, 0.0, travelled), hit, hit & self._contact_is_inner, failed)
 
     def _distances(self, ids: IntArray | slice) -> FloatArray:
         return self._geodesic.distances(self._pose[ids, :2], self._goal_number[ids]) / self.layout.cell_size_m

@@ -36,8 +36,8 @@ class UnicycleVectorEnv(RobotVectorEnv):
     def _drive(self, actions: AnyArray) -> Motion:
         wheels = self.robot.wheel_fractions(actions)
         forward, turn = wheels.mean(axis=1), (wheels[:, 1] - wheels[:, 0]) / 2
-        travelled, hit = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=bool)
-        inner = np.zeros(self.num_envs, dtype=bool)
+        travelled = np.zeros(self.num_envs)
+        begins, refused, failed = (np.zeros(self.num_envs, dtype=bool) for _ in range(3))
         heading = self._pose[:, 2].copy()
         _roll(
             self._pose,
@@ -49,16 +49,17 @@ class UnicycleVectorEnv(RobotVectorEnv):
             self.layout.walls,
             self.layout.cell_size_m,
             self._contact,
+            self._contact_is_inner,
             travelled,
-            hit,
-            inner,
+            begins,
+            refused,
         )
         turned = self._pose[:, 2] - heading
         self._pose[:, 2] = (self._pose[:, 2] + np.pi) % (2 * np.pi) - np.pi
         self._speed[:, 0] = np.copysign(travelled, forward) / (self.control_period_s * self.robot.max_speed_m_s)
         self._speed[:, 1] = turned / (self.control_period_s * self.robot.max_turn_rad_s)
         self._last_action = actions
-        return Motion(travelled, hit, inner, np.zeros(self.num_envs, dtype=bool))
+        return self._motion(travelled, begins, refused, failed)
 
     def render(self) -> tuple[Any, ...] | None:
         """A picture per environment; the window of ``human`` shows the first."""
@@ -129,9 +130,10 @@ def _roll(
     walls: BoolArray,
     cell: float,
     contact: FloatArray,
+    contact_is_inner: BoolArray,
     travelled: FloatArray,
-    hits: BoolArray,
-    inner_hits: BoolArray,
+    begins: BoolArray,
+    refused: BoolArray,
 ) -> None:
     """Constant-twist arcs (Siegwart et al. 2011, section 3.2.3), without their forward part at a wall."""
     n_substeps = int(np.ceil(period / SUBSTEP_S - 1e-9))
@@ -151,9 +153,10 @@ def _roll(
             gap, ux, uy, inner = clearance(to_x, to_y, walls, cell)
             if gap < radius and (to_x - x) * ux + (to_y - y) * uy > 0.0:
                 if slides or contact[i, 0] * ux + contact[i, 1] * uy <= SAME_WALL:
-                    hits[i] = True
-                    inner_hits[i] = inner_hits[i] or inner
+                    begins[i] = True
                 contact[i, 0], contact[i, 1] = ux, uy
+                contact_is_inner[i] = inner
+                refused[i] = not slides
                 if slides:
                     to_x, to_y = to_x + ux * (gap - radius), to_y + uy * (gap - radius)
                 if not slides or clearance(to_x, to_y, walls, cell)[0] < radius - 1e-6:  # a second wall
