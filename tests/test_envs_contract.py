@@ -829,7 +829,7 @@ def test_two_walls_of_a_corner_are_two_collisions(env_id: str) -> None:
     for _ in range(8):
         info = env.step([1.0, 0.0])[4]
     assert info["collisions"] == 1
-    while info["pose"][2] < np.pi / 2 - 0.1:
+    while info["pose"][2] < np.pi / 2 + 0.02:  # less, and the right wall refuses to let it go ahead
         info = env.step([0.0, 0.2])[4]
     for _ in range(10):
         info = env.step([1.0, 0.0])[4]
