@@ -205,3 +205,12 @@ def test_an_unknown_kind_of_agent_is_named(tmp_path: Path) -> None:
 
     with pytest.raises(InputError, match="unknown kind 'oracle'"):
         load_agent(tmp_path, "plan")
+
+
+def test_a_second_checkpoint_of_the_same_step_takes_the_next_name(tmp_path: Path) -> None:
+    """A run that is interrupted before its second agent took a step must not lose the first one."""
+    for name in ("plan", "q-learning"):
+        save_agent(Planner(np.zeros((2, 4))), tmp_path, 0, name=name)
+
+    assert {path.name for path in tmp_path.iterdir()} == {"step-000000000000", "step-000000000001"}
+    assert load_agent(tmp_path, "plan").kind == load_agent(tmp_path, "q-learning").kind == "plan"

@@ -54,13 +54,18 @@ def save_agent(agent: Agent, directory: Path, step: int, *, name: str) -> Path:
     for part in aside.iterdir():
         _sync(part)
     _sync(aside)
-    final = directory / f"step-{step:012d}"
-    if final.exists():
-        shutil.rmtree(final)
+    final = _fresh(directory, step)
     aside.rename(final)
     _sync(directory)
     for old in _checkpoints(directory, name)[KEPT:]:
         shutil.rmtree(old)
+    return final
+
+
+def _fresh(directory: Path, step: int) -> Path:
+    """The checkpoint's name, or the next free one: nothing that was saved is ever overwritten."""
+    while (final := directory / f"step-{step:012d}").exists():
+        step += 1
     return final
 
 
