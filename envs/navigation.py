@@ -65,7 +65,8 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         task: A name or a ``Task``.
         reward: A preset's name or a ``Reward``.
         max_episode_steps: Steps after which an episode is truncated; none without it.
-        render_mode: ``rgb_array`` draws the first robot's world.
+        render_mode: How ``render`` shows the worlds.
+        robot: Its numbers; DiffDrive's model is always that of the Burger.
         autoreset: Start the next episode in the step that ends one. Off for the single environment.
     """
 
@@ -187,7 +188,7 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         """Drive every robot for one step.
 
         Raises:
-            InputError: When an action is not in the action space; nothing has changed then.
+            InputError: When an action has the wrong shape, type or, for moves, range; nothing has changed then.
             ResetNeeded: Before the first reset.
         """
         if not self._has_reset:
@@ -360,6 +361,10 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
                 fixed[key] = np.array(_free_cell(options[key], key, layout))
         if "start" in fixed and "goal" in fixed and (fixed["start"] == fixed["goal"]).all():
             raise InputError(f"reset options start and goal are both {options['start']}: they must differ")
+        for key, others in (("start", self.task.goal_cells(layout)), ("goal", self.task.start_cells(layout))):
+            if key in fixed and len(fixed) == 1 and (others == fixed[key]).all():
+                what = "goal" if key == "start" else "start"
+                raise InputError(f"reset option {key} {options[key]} is the only {what} of this task: give both")
         heading = options.get("heading_rad")
         if heading is not None:
             if isinstance(heading, bool) or not isinstance(heading, numbers.Real) or not np.isfinite(float(heading)):
@@ -429,11 +434,15 @@ class NavigationEnv(gym.Env[Any, Any], Generic[VectorWorld]):
             self.worlds.max_episode_steps = limit
         self.worlds.use_generators([self.np_random])
         observations, info = self.worlds.reset(options=options)
+        if self.render_mode == "human":  # Gymnasium's convention: the window needs no call
+            self.render()
         return _one(observations), _one_info(info)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Drive for one step; see ``NavigationVectorEnv.step``."""
         observations, rewards, terminated, truncated, info = self.worlds.step(as_array(action)[None])
+        if self.render_mode == "human":
+            self.render()
         return _one(observations), float(rewards[0]), bool(terminated[0]), bool(truncated[0]), _one_info(info)
 
     def render(self) -> Any:

@@ -13,6 +13,7 @@ import re
 import shlex
 import signal
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -81,6 +82,8 @@ class Ladder(_Run):
 
     def _problem(self) -> tuple[Problem, dict[str, Any]]:
         """The problem, and the configuration as JSON values that need no other file."""
+        if not 0 <= self.seed < 2**32:
+            raise InputError(f"--seed {self.seed} is outside 0 to 4294967295")
         problem = Problem.load(self.layout, self.task, self.reward)
         layout = self.layout if self.layout in NAMED_LAYOUTS else problem.layout.to_text()
         config = asdict(replace(self, layout=layout, run_dir=None, config=None))
@@ -132,6 +135,10 @@ class Evaluate:
 
         if self.episodes < 1:
             raise InputError(f"--episodes {self.episodes} must be at least 1")
+        if self.seed is not None and self.seed < 0:
+            raise InputError(f"--seed {self.seed} must be at least 0")
+        if self.output is not None:
+            _check_folder("--output", self.output)
         run = RunDirectory.open(self.run)
         with _progress() as on_stage:
             results = evaluate_again(run, self.episodes, self.seed, on_stage)
@@ -162,10 +169,7 @@ class View:
         if self.screenshot is None:
             open_viewer(recording)
             return 0
-        if not self.screenshot.parent.is_dir():
-            raise InputError(
-                f"--screenshot {str(self.screenshot)!r}: there is no folder {str(self.screenshot.parent)!r}"
-            )
+        _check_folder("--screenshot", self.screenshot)
         screenshot(recording, self.screenshot, time_s=self.time_s)
         stdout.print(str(self.screenshot))
         return 0
@@ -177,8 +181,8 @@ class LayoutCommand:
 
     action: Annotated[Literal["draw", "check", "generate"], tyro.conf.Positional] = "draw"
     """draw it, check it, or generate a new one."""
-    source: Annotated[str, tyro.conf.Positional] = "classic"
-    """To draw or check: a named layout, a text file, or a text. To generate: random or maze."""
+    source: Annotated[str, tyro.conf.Positional] = ""
+    """To draw or check: a named layout, a text file, or a text (classic). To generate: random (the default) or maze."""
     rows: int = 11
     """Of a generated layout."""
     columns: int = 11
@@ -192,7 +196,7 @@ class LayoutCommand:
 
     def __call__(self) -> int:
         """Run it."""
-        layout = self._generated() if self.action == "generate" else Layout.load(self.source)
+        layout = self._generated() if self.action == "generate" else Layout.load(self.source or "classic")
         if self.action == "check":
             stdout.print(
                 f"ok: {layout.name}, {layout.n_rows} x {layout.n_cols} cells of {layout.cell_size_m} m, "
@@ -200,6 +204,7 @@ class LayoutCommand:
                 f"{len(layout.start_cells)} starts, {len(layout.goal_cells)} goals, every goal reachable"
             )
         elif self.output is not None:
+            _check_folder("--output", self.output)
             if self.output.exists():
                 raise InputError(f"--output {str(self.output)!r} exists: name a new file")
             self.output.write_text(layout.to_text(), encoding="utf-8")
@@ -208,7 +213,7 @@ class LayoutCommand:
         return 0
 
     def _generated(self) -> Layout:
-        if self.source in ("random", "classic"):  # classic is the default that a generator has no use for
+        if self.source in ("", "random"):
             return Layout.random(n_rows=self.rows, n_cols=self.columns, density=self.density, seed=self.seed)
         if self.source == "maze":
             return Layout.maze(n_rows=self.rows, n_cols=self.columns, seed=self.seed)
@@ -294,17 +299,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
+    cause: BaseException | None = None
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         sys.exit(_run(words))
     except InputError as error:
-        code, message = 2, str(error)
+        code, message, cause = 2, str(error), error
     except (ViewerError, RenderingError, OSError) as error:
-        code, message = 3, str(error)
-    except KeyboardInterrupt:
-        code, message = 130, "interrupted; what was learnt so far is saved in the run directory"
+        code, message, cause = 3, str(error), error
+    except KeyboardInterrupt as error:
+        code, message, cause = 130, "interrupted; a run's directory holds what it has learnt so far", error
     if debug:
-        stderr.print_exception()
+        stderr.print("".join(traceback.format_exception(cause)), markup=False)
     stderr.print(f"gridnav: {message}", markup=False)
     # Threads of a half-done step must not keep an interrupted run alive.
     sys.stdout.flush()
@@ -341,6 +347,7 @@ def _parse(config: Callable[..., Config], name: str, words: list[str]) -> Config
 
 def _with_config(name: str, words: list[str]) -> list[str]:
     """The flags of ``--config FILE`` in front of the others, so that both are checked alike and the others win."""
+    words = [part for word in words for part in (word.split("=", 1) if word.startswith("--config=") else [word])]
     if "--config" not in words:
         return words
     at = words.index("--config")
@@ -359,6 +366,11 @@ def _help() -> None:
     )
     for name, command in COMMANDS.items():
         stdout.print(f"  {name:<13}{(command.__doc__ or '').splitlines()[0]}")
+
+
+def _check_folder(flag: str, file: Path) -> None:
+    if not file.parent.is_dir():
+        raise InputError(f"{flag} {str(file)!r}: there is no folder {str(file.parent)!r}")
 
 
 def _home(agent: str) -> str:

@@ -88,7 +88,7 @@ def _learn(seed: int) -> tuple[QLearning, float]:
     began = time.perf_counter()
     worlds = PROBLEM.worlds("GridWorld", config.num_envs, task=replace(PROBLEM.task, starts="any"))
     table = QLearning(worlds.single_observation_space, worlds.single_action_space, config)
-    table.learn(worlds, steps=BUDGET.q_learning_steps)
+    table.learn(worlds, steps=BUDGET.q_learning_visits * table.action_values.size)
     return table, time.perf_counter() - began
 
 

@@ -8,4 +8,4 @@ run=$(mktemp -d)/ladder
 python3 start.py ladder --run-dir "$run" --seed 0
 mkdir -p docs
 python3 start.py view "$run" --screenshot docs/ladder.png
-cp "$run/figures/learning.png" "$run/figures/trajectories.png" docs/
+cp "$run/figures/learning.png" docs/

@@ -43,12 +43,15 @@ def run(*words: str) -> int:
         (["train", "--sed", "1"], "--sed"),
         (["train", "--seed", "one"], "one"),
         (["train", "--budget", "huge"], "huge"),
+        (["train", "--seed", "-1"], "-1"),
         (["train", "--config", "missing.json"], "missing.json"),
+        (["train", "--config=missing.json"], "missing.json"),
         (["train", "--config"], "--config"),
         (["view"], "view"),
         (["view", "no-such-run"], "no-such-run"),
         (["evaluate", "no-such-run"], "no-such-run"),
         (["layout", "check", "..\n."], "line 2"),
+        (["layout", "draw", "--output", "missing/maze.txt"], "missing"),
         (["layout", "generate", "maze", "--rows", "4"], "4 x 11"),
         (["layout", "generate", "spiral"], "spiral"),
         (["layout", "generate", "random", "--density", "2"], "2.0"),
@@ -153,3 +156,19 @@ def test_an_interrupted_training_leaves_a_checkpoint_and_says_so(in_empty_folder
     assert process.returncode == 130
     assert "Traceback" not in errors
     assert list(Path("run/checkpoints").glob("step-*/manifest.json"))
+
+
+def test_debug_shows_the_traceback_and_keeps_the_exit_code(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("train", "--layout", "no-such-maze", "--debug") == 2
+
+    assert "InputError: unknown layout" in capsys.readouterr().err
+
+
+def test_a_damaged_run_is_refused(in_empty_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("run").mkdir()
+    Path("run/config.json").write_text('{"layout": "classic"}', encoding="utf-8")
+    Path("run/evaluation.json").write_text("{}", encoding="utf-8")
+
+    assert run("evaluate", "run") == 2
+
+    assert "no whole run" in capsys.readouterr().err

@@ -860,3 +860,10 @@ def test_pressing_against_a_wall_is_another_collision_every_cell_time(env_id: st
     counts = [env.step([1.0, 0.0] if env_id in ROBOTS else 3)[4]["collisions"] for _ in range(3 * per_bump)]
 
     assert counts[per_bump - 1 :: per_bump] == [2, 3, 4]
+
+
+@pytest.mark.parametrize("options", [{"start": (8, 9)}, {"goal": (0, 0)}])
+def test_a_start_or_goal_that_leaves_no_other_end_is_refused(env_id: str, options: dict[str, Any]) -> None:
+    env = gym.make(env_id, layout="corridors")  # one start and one goal, here swapped
+    with pytest.raises(ValueError, match="give both|cannot name"):
+        env.reset(seed=0, options=options)

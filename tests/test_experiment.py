@@ -93,7 +93,7 @@ def test_a_reward_that_pays_for_spinning_is_found_out() -> None:
 
 def test_the_ladder_climbs_and_writes_everything(tmp_path: Path) -> None:
     run = RunDirectory.create(tmp_path / "run", "ladder", {"command": "ladder"})
-    budget = Budget(q_learning_steps=400_000, ppo_steps=4096, episodes=4)
+    budget = Budget(q_learning_visits=150, ppo_steps=4096, episodes=4)
 
     results = climb(PROBLEM, budget, 0, run, "gridnav ladder", {"seed": 0}, quiet)
 

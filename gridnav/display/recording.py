@@ -90,7 +90,7 @@ def write_recording(
     if len(ends) > 1:
         raise ValueError(f"the rollouts of a recording share one start and goal, not {sorted(ends)}")
     shown = {key: str(value) for key, value in (properties or {}).items()}
-    distance = Geodesic(layout, robot.radius_m if 2 * robot.radius_m < layout.cell_size_m else 0.0)
+    distance = Geodesic(layout, min(robot.radius_m, 0.49 * layout.cell_size_m))
 
     recording = rr.RecordingStream("gridnav", send_properties=False)
     recording.save(path, default_blueprint=_blueprint(layout, traces))

@@ -26,7 +26,7 @@ class Rung:
     name: str
     """What the reader knows it by, unique in the report."""
     world: str
-    """Where it was trained and evaluated, such as ``gridnav/DiffDrive-v0``."""
+    """Where it was trained and evaluated, such as ``DiffDrive``."""
     agent: str
     """What learnt, such as ``PPO``."""
     carried: str

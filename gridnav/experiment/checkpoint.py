@@ -31,7 +31,7 @@ def save_agent(agent: Agent, directory: Path, step: int, *, name: str) -> Path:
     Args:
         agent: What to save.
         directory: Made if it does not exist.
-        step: Environment steps the run has taken so far; its agents never share one.
+        step: Environment steps the run has taken so far; the next free number is taken where two agents share one.
         name: Which of the run's agents it is; older checkpoints of the same name are pruned.
 
     Returns:

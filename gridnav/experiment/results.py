@@ -18,9 +18,11 @@ from gridnav.experiment.evaluation import EVALUATION_SEED, evaluate, policy_for
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory, read_json, write_json
 from gridnav.experiment.training import AgentKind, Budget, OnStage, Problem, Result, Workshop
 from gridnav.problem.geodesic import cell_distances
+from gridnav.problem.types import InputError
 
 DRAWN_EPISODES = 40
 """Ways drawn per panel: more would hide each other and swell the page."""
+_NEEDED = ("world", "agent", "carried", "checkpoint")
 LIBRARIES = ("gridnav", "mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "rerun-sdk")
 
 
@@ -211,9 +213,13 @@ def evaluate_again(run: RunDirectory, episodes: int, seed: int | None, on_stage:
         InputError: When the run holds no evaluation or lacks a checkpoint.
     """
     config, stored = run.read_config(), read_json(run.evaluation)
-    problem = Problem.load(config["layout"], config["task"], config["reward"])
+    try:
+        problem = Problem.load(config["layout"], config["task"], config["reward"])
+        rows = {name: {key: row[key] for key in _NEEDED} for name, row in stored["results"].items()}
+    except (KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{str(run.path)!r} is no whole run: its {error} is missing or damaged") from None
     results = []
-    for name, row in stored["results"].items():
+    for name, row in rows.items():
         agent = load_agent(run.checkpoints, row["checkpoint"])
         worlds = problem.worlds(row["world"], episodes)
         report = on_stage(f"evaluating {name}")

@@ -26,8 +26,8 @@ BudgetName = Literal["quick", "default", "full"]
 class Budget:
     """How much a run may spend."""
 
-    q_learning_steps: int
-    """Environment steps of tabular Q-learning."""
+    q_learning_visits: int
+    """Environment steps of tabular Q-learning, per entry of its table."""
     ppo_steps: int
     """Environment steps of one PPO training."""
     episodes: int
@@ -35,9 +35,9 @@ class Budget:
 
 
 BUDGETS: dict[str, Budget] = {
-    "quick": Budget(q_learning_steps=600_000, ppo_steps=120_000, episodes=50),
-    "default": Budget(q_learning_steps=600_000, ppo_steps=640_000, episodes=200),
-    "full": Budget(q_learning_steps=2_000_000, ppo_steps=2_000_000, episodes=1000),
+    "quick": Budget(q_learning_visits=190, ppo_steps=120_000, episodes=50),
+    "default": Budget(q_learning_visits=190, ppo_steps=640_000, episodes=200),
+    "full": Budget(q_learning_visits=600, ppo_steps=2_000_000, episodes=1000),
 }
 
 
@@ -189,7 +189,7 @@ class Workshop:
             task = replace(problem.task, starts="any")
             worlds = problem.worlds(world, config.num_envs, task=task)
             table = QLearning(worlds.single_observation_space, worlds.single_action_space, config)
-            return table, worlds, self.budget.q_learning_steps
+            return table, worlds, self.budget.q_learning_visits * table.action_values.size
         from gridnav.agents import PPOAgent, PPOConfig  # torch takes seconds to import
 
         ppo_config = PPOConfig(seed=self.seed)

@@ -16,7 +16,6 @@ from gridnav.problem.types import BoolArray, Cell, FloatArray, IntArray
 
 MOVES = np.array([(-1, 0), (1, 0), (0, -1), (0, 1)])
 """Row and column step of the actions 0 up, 1 down, 2 left, 3 right."""
-MOVE_NAMES = ("up", "down", "left", "right")
 MOVE_HEADINGS_RAD = np.array([np.pi / 2, -np.pi / 2, np.pi, 0.0])
 """Heading of each move in the world frame (x right, y up)."""
 SIDEWAYS = np.array([(2, 3), (2, 3), (0, 1), (0, 1)])
