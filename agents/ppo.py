@@ -112,12 +112,11 @@ class PPOAgent(Agent):
         )
         model.policy.load_state_dict(self.policy.state_dict())
         model.set_logger(Logger(folder=None, output_formats=[]))
-        reporter = _Reporter(adapter, steps, config, on_progress)
         try:
-            model.learn(steps, callback=reporter)
+            model.learn(steps, callback=_Reporter(adapter, steps, config, on_progress))
         finally:
             # What was learnt before an interrupt counts too.
-            self.policy.load_state_dict(reporter.best_weights or model.policy.state_dict())
+            self.policy.load_state_dict(model.policy.state_dict())
 
     def state(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         """Weights; spaces and hyper-parameters."""
@@ -205,15 +204,12 @@ _NOTHING: dict[str, Any] = {}
 
 
 class _Reporter(BaseCallback):
-    """Between rollouts: reports, narrows exploration, keeps the best weights, stops at the target success."""
+    """Between rollouts: reports, narrows exploration, and stops at the success that is asked for."""
 
     def __init__(self, adapter: Sb3VecEnv, total_steps: int, config: PPOConfig, on_progress: OnProgress | None) -> None:
         super().__init__()
         self._window = adapter.window
         self._total_steps, self._config, self._on_progress = total_steps, config, on_progress
-        self._best_success = 0.0
-        self.best_weights: dict[str, torch.Tensor] | None = None
-        """Those of the highest training success, the latest among equals; late in training PPO can fall back."""
 
     def _on_step(self) -> bool:
         target = self._config.target_success
@@ -223,14 +219,7 @@ class _Reporter(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         self._cap_exploration()
-        self._keep_best()
         self._report()
-
-    def _keep_best(self) -> None:
-        success = self._window.metrics["success_rate"]
-        if self._window.is_full and success > 0.0 and success >= self._best_success:
-            self._best_success = success
-            self.best_weights = {name: weight.clone() for name, weight in self.model.policy.state_dict().items()}
 
     def _cap_exploration(self) -> None:
         first, last = self._config.log_std_init, self._config.log_std_final
@@ -253,5 +242,4 @@ class _Reporter(BaseCallback):
         self._on_progress(Progress(self.num_timesteps, self._total_steps, metrics))
 
     def _on_training_end(self) -> None:
-        self._keep_best()
         self._report()
