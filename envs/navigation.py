@@ -234,6 +234,11 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         return self._features
 
     @property
+    def step_s(self) -> float:
+        """Seconds that one step takes: a cell-time is a cell at the robot's top speed."""
+        return self.step_duration * self.layout.cell_size_m / self.robot.max_speed_m_s
+
+    @property
     def step_gamma(self) -> float:
         """Discount of one step that matches the reward's discount per cell-time."""
         return float(self.reward.gamma**self.step_duration)
@@ -321,14 +326,13 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
 
     def _info(self, terms: dict[str, FloatArray]) -> dict[str, Any]:
         """The contract's keys, each a fresh array with a leading batch axis."""
-        seconds_per_step = self.step_duration * self.layout.cell_size_m / self.robot.max_speed_m_s
         info: dict[str, Any] = {
             "is_success": self._at_goal.copy(),
             "collision": self._hit.copy(),
             "collisions": self._collisions.copy(),
             "path_length_m": self._path_length_m.copy(),
             "shortest_path_m": self._shortest_path_m.copy(),
-            "elapsed_s": self._steps * seconds_per_step,
+            "elapsed_s": self._steps * self.step_s,
             "cell": self._cell(),
             "pose": self._pose.copy(),
             "reward_terms": {name: terms[name].copy() for name in TERM_NAMES},

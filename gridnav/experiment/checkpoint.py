@@ -22,7 +22,8 @@ FORMAT = 1
 KEPT = 2
 """Checkpoints that pruning leaves."""
 MANIFEST = "manifest.json"
-LIBRARIES = ("gridnav", "numpy", "torch", "mujoco", "gymnasium", "stable-baselines3")
+LIBRARIES = ("gridnav", "numpy", "torch", "mujoco", "gymnasium", "stable-baselines3", "rerun-sdk")
+"""What decides a run's numbers and files, in checkpoints and reports."""
 
 
 def save_agent(agent: Agent, directory: Path, step: int, *, name: str) -> Path:

@@ -134,7 +134,7 @@ class _Course:
 
     def episode(self, i: int, last: dict[str, Any]) -> Episode:
         seconds = float(last["elapsed_s"])
-        step_s = self._worlds.step_duration * self._worlds.layout.cell_size_m / self._worlds.robot.max_speed_m_s
+        step_s = self._worlds.step_s
         steps = round(seconds / step_s)
         names = self._terms[0]
         trace = Trace(

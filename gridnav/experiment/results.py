@@ -13,7 +13,7 @@ from gridnav.agents import TabularAgent
 from gridnav.display.figures import learning_curves, save_figure, trajectories, value_map
 from gridnav.display.recording import write_recording
 from gridnav.display.report import Picture, Report, Rung, write_report
-from gridnav.experiment.checkpoint import load_agent
+from gridnav.experiment.checkpoint import LIBRARIES, load_agent
 from gridnav.experiment.evaluation import EVALUATION_SEED, evaluate, policy_for
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory, read_json, write_json
 from gridnav.experiment.training import AgentKind, Budget, OnStage, Problem, Result, Workshop
@@ -23,7 +23,6 @@ from gridnav.problem.types import InputError
 DRAWN_EPISODES = 40
 """Ways drawn per panel: more would hide each other and swell the page."""
 _NEEDED = ("world", "agent", "carried", "checkpoint")
-LIBRARIES = ("gridnav", "mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "rerun-sdk")
 
 
 def write_evaluation(run: RunDirectory, results: Sequence[Result], seed: int) -> None:
