@@ -9,8 +9,10 @@ from .gl import works as gl_works
 from .grid_moves import GridMoves, MoveDriver
 from .grid_world import GridWorldEnv, GridWorldVectorEnv
 from .lidar import scan
-from .navigation import NavigationEnv, NavigationVectorEnv
+from .mjcf import build_spec
+from .navigation import NavigationVectorEnv
 from .observation import FeatureVector
+from .single import NavigationEnv
 from .unicycle import UnicycleEnv, UnicycleVectorEnv
 
 __all__ = [
@@ -27,6 +29,7 @@ __all__ = [
     "RenderingError",
     "UnicycleEnv",
     "UnicycleVectorEnv",
+    "build_spec",
     "gl_works",
     "scan",
 ]

@@ -5,22 +5,26 @@ from __future__ import annotations
 from typing import Any
 
 import mujoco
+import numba
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from mujoco.batch import Batch
 
 from gridnav.problem.geodesic import clearances
-from gridnav.problem.types import AnyArray, BoolArray, FloatArray, InputError, IntArray
+from gridnav.problem.types import BoolArray, FloatArray, InputError, IntArray
 
 from . import gl
 from .mjcf import build_model
-from .navigation import Motion
-from .robot_world import RELEASE_M, SAME_WALL, RobotEnv, RobotVectorEnv, towards
+from .robot_world import RELEASE_M, SAME_WALL, RobotEnv, RobotVectorEnv
 
+TIMESTEP_S = 0.02
+"""By measurement, see docs/speed.md: 10 ms is five times as accurate and takes nearly twice as long."""
 BUMPER_PERIOD_S = 0.05
-"""The bumper is looked at this often: the Burger publishes its sensors at 20 Hz."""
+"""The bumper is looked at no less often than this: the Burger publishes its sensors at 20 Hz."""
 CONTACT_MARGIN_M = 0.003
 """A bumper this close to a wall after a contact still counts as pressed: soft contacts push the robot out a little."""
+INTO_WALL = 1e-3
+"""Forward command times the cosine of the angle to a wall from which on a command drives into it."""
 CAMERAS = ("above", "chase", "onboard")
 
 
@@ -29,6 +33,7 @@ class DiffDriveVectorEnv(RobotVectorEnv):
 
     Args:
         num_envs: Robots in the batch.
+        timestep_s: Longest timestep of the physics, seconds; a whole number of timesteps makes a control period.
         n_threads: Threads of the physics, 0 for all cores. The trajectories do not depend on it.
         camera: The camera of ``rgb_array``: ``above``, ``chase`` or ``onboard``.
         width: Of the picture, pixels.
@@ -47,6 +52,7 @@ class DiffDriveVectorEnv(RobotVectorEnv):
         self,
         num_envs: int = 1,
         *,
+        timestep_s: float = TIMESTEP_S,
         n_threads: int = 0,
         camera: str = "above",
         width: int = 480,
@@ -55,7 +61,9 @@ class DiffDriveVectorEnv(RobotVectorEnv):
     ) -> None:
         if camera not in CAMERAS:
             raise InputError(f"camera {camera!r} is none of {', '.join(CAMERAS)}")
-        self._n_threads = n_threads
+        if not 0.0005 <= timestep_s <= TIMESTEP_S:
+            raise InputError(f"timestep_s {timestep_s} is outside 0.0005 to {TIMESTEP_S} s")
+        self._timestep_s, self._n_threads = float(timestep_s), n_threads
         self._camera, self._picture_size = camera, (width, height)
         self._renderer: mujoco.Renderer | None = None
         super().__init__(num_envs, **shared)
@@ -63,13 +71,10 @@ class DiffDriveVectorEnv(RobotVectorEnv):
     def _use_layout(self) -> None:
         super()._use_layout()
         self.model = build_model(self.layout, goal_radius_m=self.task.goal_radius_m)
-        timestep = self.model.opt.timestep
-        n_substeps = round(self.control_period_s / timestep)
-        if not np.isclose(n_substeps * timestep, self.control_period_s):
-            raise InputError(
-                f"control_period_s {self.control_period_s} is no multiple of the physics timestep of {timestep} s"
-            )
-        per_look = max(1, round(BUMPER_PERIOD_S / timestep))
+        n_substeps = int(np.ceil(self.control_period_s / self._timestep_s - 1e-9))
+        self.model.opt.timestep = self.control_period_s / n_substeps
+        per_look = max(1, int(BUMPER_PERIOD_S / self.model.opt.timestep + 1e-9))
+        # How many substeps are made at once between two looks.
         self._looks = [min(per_look, n_substeps - done) for done in range(0, n_substeps, per_look)]
         self._batch = Batch(self.model, self.num_envs, nthread=self._n_threads)
         self._qpos, self._qvel, self._ctrl = (self._batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
@@ -88,55 +93,45 @@ class DiffDriveVectorEnv(RobotVectorEnv):
         self._qpos[ids, 4:6] = 0.0
         self._qpos[ids, 6] = np.sin(half)
 
-    def _drive(self, actions: AnyArray) -> Motion:
+    def _roll(self, actions: FloatArray) -> None:
         wheels = self.robot.wheel_fractions(actions)
-        forward = wheels.mean(axis=1)
-        n, stops = self.num_envs, self.task.on_collision != "slide"
-        travelled = np.zeros(n)
-        begins, refused = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
         position = self._qpos[:, :2].copy()
-        gap, direction, inner = clearances(position, self.layout)
-        with np.errstate(invalid="ignore", over="ignore"):  # a robot whose physics diverges is dealt with below
-            for n_substeps in self._looks:
-                into = towards(direction, _headings(self._qpos), forward)
-                refuse = stops & self._knows(direction) & into & (gap < self.robot.radius_m + CONTACT_MARGIN_M)
-                refused |= refuse
-                allowed = wheels - np.where(refuse, forward, 0.0)[:, None]
-                self._ctrl[:] = allowed * self.robot.max_wheel_speed_rad_s
+        stops = self.task.on_collision != "slide"
+        for n_substeps in [0, *self._looks]:
+            if n_substeps:
                 self._batch.step(nstep=n_substeps)
-                gap, direction, inner = clearances(self._qpos[:, :2], self.layout)
-                touches = (gap < self.robot.radius_m) & towards(direction, _headings(self._qpos), forward)
-                begins |= touches & ~self._knows(direction) if stops else touches
-                self._contact[touches], self._contact_is_inner[touches] = direction[touches], inner[touches]
-                self._contact[gap > self.robot.radius_m + RELEASE_M] = 0.0
-                travelled += np.hypot(*(self._qpos[:, :2] - position).T)
-                position[:] = self._qpos[:, :2]
-        failed = self._diverged()
-        if failed.any():
+            gap, direction, inner = clearances(self._qpos, self.layout)
+            _bump(
+                n_substeps > 0,
+                stops,
+                self.robot.radius_m,
+                self.robot.max_wheel_speed_rad_s,
+                self._qpos,
+                wheels,
+                gap,
+                direction,
+                inner,
+                position,
+                self._contact,
+                self._contact_is_inner,
+                self._travelled_m,
+                self._begins,
+                self._refused,
+                self._ctrl,
+            )
+        _sense(
+            self.robot.max_speed_m_s,
+            self.robot.max_turn_rad_s,
+            self._qpos,
+            self._qvel,
+            self._batch.warning,
+            self._pose,
+            self._speed,
+            self._failed,
+        )
+        if self._failed.any():
             # Back to the last good pose, so that what is observed stays finite.
-            self._rest(np.flatnonzero(failed))
-        self._sense()
-        self._last_action = actions
-        return self._motion(travelled, begins, refused, failed)
-
-    def _knows(self, direction: FloatArray) -> BoolArray:
-        """Whether the nearest wall is the one that the bumper already met."""
-        known: BoolArray = (self._contact * direction).sum(axis=1) > SAME_WALL
-        return known
-
-    def _sense(self) -> None:
-        heading = _headings(self._qpos)
-        self._pose = np.column_stack([self._qpos[:, :2], heading])
-        forward = self._qvel[:, 0] * np.cos(heading) + self._qvel[:, 1] * np.sin(heading)
-        # A free joint's angular velocity is in the body frame; its z axis is the robot's.
-        turn = self._qvel[:, 5]
-        self._speed = np.column_stack([forward / self.robot.max_speed_m_s, turn / self.robot.max_turn_rad_s])
-
-    def _diverged(self) -> BoolArray:
-        """Non-finite states, and warnings of the engine, which stay counted until the environment's next reset."""
-        finite = np.isfinite(self._qpos).all(axis=1) & np.isfinite(self._qvel).all(axis=1)
-        diverged: BoolArray = ~finite | (self._batch.warning[:, :, 1] > 0).any(axis=1)
-        return diverged
+            self._rest(np.flatnonzero(self._failed))
 
     def render(self) -> tuple[Any, ...] | None:
         """A picture per environment, shape ``(height, width, 3)``, from the chosen camera.
@@ -213,8 +208,83 @@ class DiffDriveEnv(RobotEnv[DiffDriveVectorEnv]):
         return self.worlds.model
 
 
-def _headings(qpos: FloatArray) -> FloatArray:
-    """Yaw of free joints, radians in (-pi, pi], shape ``(n,)``; MuJoCo's quaternions are w, x, y, z."""
-    w, x, y, z = qpos[:, 3:7].T
-    headings: FloatArray = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    return headings
+# `clearances` is called from outside: a function that
+# compiles in another file's would not notice its changes, and so could not be cached on disk.
+@numba.njit(cache=True)
+def _bump(
+    has_driven: bool,
+    stops: bool,
+    radius: float,
+    max_wheel_speed: float,
+    qpos: FloatArray,
+    wheels: FloatArray,
+    gap: FloatArray,
+    direction: FloatArray,
+    inner: BoolArray,
+    position: FloatArray,
+    contact: FloatArray,
+    contact_is_inner: BoolArray,
+    travelled: FloatArray,
+    begins: BoolArray,
+    refused: BoolArray,
+    ctrl: FloatArray,
+) -> None:
+    """Note the contacts of the way since the last look, and refuse what drives on into a wall."""
+    for i in range(len(qpos)):
+        forward = (wheels[i, 0] + wheels[i, 1]) / 2
+        ahead_x, ahead_y = _ahead(qpos, i)
+        into = forward * (direction[i, 0] * ahead_x + direction[i, 1] * ahead_y) > INTO_WALL
+        if has_driven:
+            x, y = qpos[i, 0], qpos[i, 1]
+            travelled[i] += np.sqrt((x - position[i, 0]) ** 2 + (y - position[i, 1]) ** 2)
+            position[i, 0], position[i, 1] = x, y
+            if gap[i] < radius and into:
+                begins[i] |= not stops or not _knows(contact, direction, i)
+                contact[i] = direction[i]
+                contact_is_inner[i] = inner[i]
+            if gap[i] > radius + RELEASE_M:
+                contact[i] = 0.0
+        refuse = stops and into and gap[i] < radius + CONTACT_MARGIN_M and _knows(contact, direction, i)
+        refused[i] |= refuse
+        for side in range(2):
+            ctrl[i, side] = (wheels[i, side] - (forward if refuse else 0.0)) * max_wheel_speed
+
+
+@numba.njit(cache=True)
+def _knows(contact: FloatArray, direction: FloatArray, i: int) -> bool:
+    """Whether the nearest wall is the one that the bumper already met."""
+    return contact[i, 0] * direction[i, 0] + contact[i, 1] * direction[i, 1] > SAME_WALL
+
+
+@numba.njit(cache=True)
+def _sense(
+    max_speed: float,
+    max_turn: float,
+    qpos: FloatArray,
+    qvel: FloatArray,
+    warning: IntArray,
+    pose: FloatArray,
+    speed: FloatArray,
+    failed: BoolArray,
+) -> None:
+    """Poses and speeds of the robots whose physics holds; the others keep their last pose, at rest.
+
+    The engine's warnings stay counted until the environment's next reset.
+    """
+    for i in range(len(qpos)):
+        failed[i] = not np.isfinite(qpos[i]).all() or not np.isfinite(qvel[i]).all() or (warning[i, :, 1] > 0).any()
+        if failed[i]:
+            speed[i] = 0.0
+            continue
+        ahead_x, ahead_y = _ahead(qpos, i)
+        pose[i, 0], pose[i, 1], pose[i, 2] = qpos[i, 0], qpos[i, 1], np.arctan2(ahead_y, ahead_x)
+        speed[i, 0] = (qvel[i, 0] * ahead_x + qvel[i, 1] * ahead_y) / max_speed
+        # A free joint's angular velocity is in the body frame; its z axis is the robot's.
+        speed[i, 1] = qvel[i, 5] / max_turn
+
+
+@numba.njit(cache=True)
+def _ahead(qpos: FloatArray, i: int) -> tuple[float, float]:
+    """Where a free joint's x axis points, on the floor; MuJoCo's quaternions are w, x, y, z."""
+    w, x, y, z = qpos[i, 3], qpos[i, 4], qpos[i, 5], qpos[i, 6]
+    return 1.0 - 2.0 * (y * y + z * z), 2.0 * (w * z + x * y)

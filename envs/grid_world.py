@@ -5,17 +5,20 @@ from __future__ import annotations
 from typing import Any, Literal
 
 import gymnasium as gym
+import numba
 import numpy as np
 from gymnasium.spaces import Discrete
 from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
 
 from gridnav.problem.geodesic import cell_distances
 from gridnav.problem.grid_mdp import MOVE_HEADINGS_RAD, SIDEWAYS, MoveTable
 from gridnav.problem.layout import Layout
 from gridnav.problem.types import AnyArray, BoolArray, FloatArray, InputError, IntArray
 
-from .navigation import Motion, NavigationEnv, NavigationVectorEnv, as_array
+from .navigation import NavigationVectorEnv, as_array
 from .painter import Painter
+from .single import NavigationEnv
 
 ObservationMode = Literal["cell_goal", "cell", "features"]
 OBSERVATION_MODES = ("cell_goal", "cell", "features")
@@ -58,15 +61,18 @@ class GridWorldVectorEnv(NavigationVectorEnv):
     def _use_layout(self) -> None:
         super()._use_layout()
         self._table = MoveTable.of(self.layout)
+        self._cells = np.stack(np.divmod(np.arange(self.layout.n_cells), self.layout.n_cols), axis=1)
+        self._centres = self.layout.to_metres(self._cells)
         self._position = np.zeros(self.num_envs, dtype=np.int64)  # number of the cell, row by row
-        self._centres = self.layout.to_metres(
-            np.stack(np.divmod(np.arange(self.layout.n_cells), self.layout.n_cols), axis=1)
-        )
-        # Place of each cell among the goals, -1 where it is none; and, per goal met so far, distances from all cells.
+        # Place of each cell among the goals, -1 where it is none.
+        self._n_goals = len(self.goal_cells)
         self._goal_rank = np.full(self.layout.n_cells, -1)
-        self._goal_rank[self._numbers(self.goal_cells)] = np.arange(len(self.goal_cells))
-        self._table_row = np.full(self.layout.n_cells, -1)
-        self._moves_to_goal = np.empty((0, self.layout.n_cells))
+        self._goal_rank[self._numbers(self.goal_cells)] = np.arange(self._n_goals)
+        # Moves from all cells to each goal met so far, and which row of them is a cell's (-1 for none).
+        self._moves_to_goal: NDArray[np.uint16] = np.empty((0, self.layout.n_cells), dtype=np.uint16)
+        self._row_of_cell = np.full(self.layout.n_cells, -1)
+        # Each robot's goal: number of its cell, row among the moves, and place among the goals.
+        self._goal_number, self._goal_row, self._goal_place = (np.zeros(self.num_envs, np.int64) for _ in range(3))
 
     def _numbers(self, cells: IntArray) -> IntArray:
         return cells[..., 0] * self.layout.n_cols + cells[..., 1]
@@ -89,11 +95,21 @@ class GridWorldVectorEnv(NavigationVectorEnv):
 
     def _place(self, ids: IntArray) -> None:
         self._position[ids] = self._numbers(self._start[ids])
-        for goal in np.unique(self._numbers(self._goal[ids])):
-            if self._table_row[goal] < 0:
-                self._table_row[goal] = len(self._moves_to_goal)
-                row = cell_distances(self.layout, divmod(int(goal), self.layout.n_cols)).ravel()
-                self._moves_to_goal = np.concatenate([self._moves_to_goal, row[None]])
+        goals = self._numbers(self._goal[ids])
+        rows = self._row_of_cell[goals]
+        if rows.min() < 0:
+            self._add_goals(np.unique(goals[rows < 0]))
+            rows = self._row_of_cell[goals]
+        self._goal_number[ids], self._goal_row[ids], self._goal_place[ids] = goals, rows, self._goal_rank[goals]
+        self._transition.next_distance[ids] = self._moves_to_goal[rows, self._position[ids]]
+
+    def _add_goals(self, goals: IntArray) -> None:
+        """Work out the moves from all cells to further goals, given by their cells' numbers."""
+        cells = [divmod(int(goal), self.layout.n_cols) for goal in goals]
+        moves = np.stack([cell_distances(self.layout, cell).ravel() for cell in cells])
+        moves[~np.isfinite(moves)] = 0.0  # walls: nobody is ever there
+        self._row_of_cell[goals] = len(self._moves_to_goal) + np.arange(len(goals))
+        self._moves_to_goal = np.concatenate([self._moves_to_goal, moves.astype(np.uint16)])
 
     def _valid(self, actions: AnyArray) -> AnyArray:
         array = as_array(actions)
@@ -101,50 +117,50 @@ class GridWorldVectorEnv(NavigationVectorEnv):
             raise InputError(
                 f"action {_short(actions)} must be a whole number per environment, 0 up, 1 down, 2 left or 3 right"
             )
-        if ((array < 0) | (array > 3)).any():
+        if array.min() < 0 or array.max() > 3:
             wrong = array[(array < 0) | (array > 3)][0]
             raise InputError(f"action {wrong} is outside Discrete(4): 0 up, 1 down, 2 left, 3 right")
         return array
 
-    def _drive(self, actions: AnyArray) -> Motion:
+    def _drive(self, actions: AnyArray) -> None:
         if self.slip > 0.0:
             # Slip: with probability `slip` the move goes to one of its two sides, each as likely.
             draws = self._streams.draw(np.arange(self.num_envs), 2)
             side = SIDEWAYS[actions, (draws[:, 1] < 0.5).astype(np.int64)]
             actions = np.where(draws[:, 0] < self.slip, side, actions)
-        before = self._position
-        hit = self._table.hit[before, actions]
-        self._position = self._table.next_cell[before, actions]
-        self._pose[:, :2] = self._centres[self._position]
-        self._pose[:, 2] = MOVE_HEADINGS_RAD[actions]
-        self._speed[:, 0] = ~hit
-        self._last_action[:, 0] = 1.0
-        return Motion(
-            travelled_m=np.where(hit, 0.0, self.layout.cell_size_m),
-            hit=hit,
-            hit_inner_wall=self._table.hit_inner_wall[before, actions],
-            failed=np.zeros(self.num_envs, dtype=bool),
+        step = self._transition
+        _move(
+            actions,
+            self._table.next_cell,
+            self._table.hit_inner_wall,
+            self._cells,
+            self._centres,
+            self._moves_to_goal,
+            self._goal_number,
+            self._goal_row,
+            self._goal,
+            self.layout.cell_size_m,
+            self._position,
+            self._cell,
+            self._pose,
+            self._travelled_m,
+            step.hit,
+            step.hit_inner_wall,
+            step.at_goal,
+            step.next_distance,
+            step.manhattan,
         )
+        if self.observation == "features":
+            self._speed[:, 0] = ~step.hit
+            self._last_action[:, 0] = 1.0
 
-    def _distances(self, ids: IntArray | slice) -> FloatArray:
-        distances: FloatArray = self._moves_to_goal[
-            self._table_row[self._numbers(self._goal[ids])], self._position[ids]
-        ]
-        return distances
-
-    def _arrived(self) -> BoolArray:
-        arrived: BoolArray = self._position == self._numbers(self._goal)
-        return arrived
-
-    def _cell(self) -> IntArray:
-        return np.stack(np.divmod(self._position, self.layout.n_cols), axis=1)
-
-    def _observe(self, ids: IntArray) -> AnyArray:
+    def _observe(self, ids: IntArray | None = None) -> AnyArray:
         if self.observation == "features":
             return super()._observe(ids)
-        if self.observation == "cell":
-            return self._position[ids]
-        return self._position[ids] * len(self.goal_cells) + self._goal_rank[self._numbers(self._goal[ids])]
+        position, place = self._position, self._goal_place
+        if ids is not None:
+            position, place = position[ids], place[ids]
+        return position.copy() if self.observation == "cell" else position * self._n_goals + place
 
     def render(self) -> tuple[Any, ...] | None:
         """A picture or text per environment, as ``render_mode`` says; the window of ``human`` shows the first."""
@@ -164,7 +180,7 @@ class GridWorldVectorEnv(NavigationVectorEnv):
     def _text(self, i: int) -> str:
         """The maze with the robot R and the goal G; the robot at its goal is an asterisk."""
         grid = np.where(self.layout.walls, "#", ".")
-        cell, goal = tuple(self._cell()[i]), tuple(self._goal[i])
+        cell, goal = tuple(self._cell[i]), tuple(self._goal[i])
         grid[goal] = "G"
         grid[cell] = "*" if cell == goal else "R"
         return "\n".join("".join(row) for row in grid) + "\n"
@@ -215,6 +231,41 @@ class GridWorldEnv(NavigationEnv[GridWorldVectorEnv]):
 
     def __init__(self, *, observation: ObservationMode = "cell_goal", slip: float = 0.0, **shared: Any) -> None:
         super().__init__(GridWorldVectorEnv(1, observation=observation, slip=slip, autoreset=False, **shared))
+
+
+@numba.njit(cache=True)
+def _move(
+    actions: IntArray,
+    next_cell: IntArray,
+    bumps_inner_wall: BoolArray,
+    cells: IntArray,
+    centres: FloatArray,
+    moves_to_goal: NDArray[np.uint16],
+    goal_number: IntArray,
+    goal_row: IntArray,
+    goal: IntArray,
+    cell_size_m: float,
+    position: IntArray,
+    cell: IntArray,
+    pose: FloatArray,
+    travelled_m: FloatArray,
+    hit: BoolArray,
+    hit_inner_wall: BoolArray,
+    at_goal: BoolArray,
+    next_distance: FloatArray,
+    manhattan: FloatArray,
+) -> None:
+    for i in range(len(position)):
+        before, action = np.uint64(position[i]), np.uint64(actions[i])  # unsigned: no check for negative indices
+        now = np.uint64(next_cell[before, action])
+        position[i], hit[i] = now, now == before
+        hit_inner_wall[i] = bumps_inner_wall[before, action]
+        travelled_m[i] = 0.0 if now == before else cell_size_m
+        cell[i, 0], cell[i, 1] = cells[now, 0], cells[now, 1]
+        pose[i, 0], pose[i, 1], pose[i, 2] = centres[now, 0], centres[now, 1], MOVE_HEADINGS_RAD[action]
+        next_distance[i] = moves_to_goal[np.uint64(goal_row[i]), now]
+        manhattan[i] = abs(cell[i, 0] - goal[i, 0]) + abs(cell[i, 1] - goal[i, 1])
+        at_goal[i] = now == np.uint64(goal_number[i])
 
 
 def _short(value: Any) -> str:

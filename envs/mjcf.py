@@ -18,6 +18,11 @@ GOAL_RGBA = (0.18, 0.68, 0.38, 0.9)
 
 
 def build_model(layout: Layout, *, goal_radius_m: float = 0.15) -> mujoco.MjModel:
+    """The compiled model of ``build_spec``."""
+    return build_spec(layout, goal_radius_m=goal_radius_m).compile()
+
+
+def build_spec(layout: Layout, *, goal_radius_m: float = 0.15) -> mujoco.MjSpec:
     """The Burger on a floor, among the layout's merged walls and an outer wall.
 
     Args:
@@ -25,8 +30,8 @@ def build_model(layout: Layout, *, goal_radius_m: float = 0.15) -> mujoco.MjMode
         goal_radius_m: Radius of the goal mark, a mocap body named ``goal`` that touches nothing.
 
     Returns:
-        A model with 9 positions (free joint, left and right wheel), 8 velocities and 2 controls (wheel speeds in
-        rad/s).
+        What compiles to a model with 9 positions (free joint, left and right wheel), 8 velocities and 2 controls (wheel
+        speeds in rad/s).
     """
     spec = mujoco.MjSpec.from_string(
         resources.files("gridnav.assets").joinpath("mjcf/burger.xml").read_text(encoding="utf-8")
@@ -64,7 +69,7 @@ def build_model(layout: Layout, *, goal_radius_m: float = 0.15) -> mujoco.MjMode
     world.add_camera(name="above", pos=[width / 2, height / 2, 1.32 * reach + WALL_HEIGHT_M], quat=[1, 0, 0, 0])
     spec.stat.center = [width / 2, height / 2, 0]
     spec.stat.extent = reach
-    return spec.compile()
+    return spec
 
 
 def _add_box(

@@ -6,15 +6,14 @@ a ``NavigationEnv`` around the same world with a batch of one, so that scalar an
 
 from __future__ import annotations
 
-import inspect
 import numbers
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar
 
 import gymnasium as gym
+import numba
 import numpy as np
 from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -22,11 +21,12 @@ from gymnasium.vector.utils import batch_space
 from gridnav.problem.layout import Layout
 from gridnav.problem.reward import TERM_NAMES, Reward, Transition, total
 from gridnav.problem.robot import BURGER, Robot
-from gridnav.problem.task import DRAWS_PER_EPISODE, Task
+from gridnav.problem.task import DRAWS_PER_EPISODE, EpisodeSampler, Task
 from gridnav.problem.types import AnyArray, BoolArray, Cell, FloatArray, InputError, IntArray
 
-from .lidar import scan
+from .lidar import Lidar
 from .observation import FeatureVector
+from .random_streams import RandomStreams
 
 OPTIONS = ("start", "goal", "heading_rad", "layout")
 INFO_KEYS = (
@@ -40,20 +40,6 @@ INFO_KEYS = (
     "pose",
     "reward_terms",
 )
-
-
-@dataclass(frozen=True)
-class Motion:
-    """What one step did to ``n`` robots; each field of shape ``(n,)``."""
-
-    travelled_m: FloatArray
-    """Length driven, metres."""
-    hit: BoolArray
-    """A wall was touched."""
-    hit_inner_wall: BoolArray
-    """It was a wall of the layout, not the outer one."""
-    failed: BoolArray
-    """The physics diverged; the pose is the last good one."""
 
 
 class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
@@ -103,16 +89,21 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         self._streams = RandomStreams([np.random.default_rng() for _ in range(self.num_envs)])
 
         n = self.num_envs
+        # Where each robot is, and what its episode asks for.
         self._pose: FloatArray = np.zeros((n, 3))
-        self._start, self._goal = np.zeros((n, 2), dtype=np.int64), np.zeros((n, 2), dtype=np.int64)
-        self._goal_w = np.zeros((n, 2))
-        self._distance: FloatArray = np.zeros(n)
-        self._shortest_path_m: FloatArray = np.zeros(n)
-        self._steps, self._collisions = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
-        self._hit, self._at_goal, self._failed = (np.zeros(n, dtype=bool) for _ in range(3))
-        self._path_length_m: FloatArray = np.zeros(n)
-        self._last_action: FloatArray = np.zeros((n, 2))
+        self._cell = np.zeros((n, 2), dtype=np.int64)
         self._speed: FloatArray = np.zeros((n, 2))
+        self._last_action: FloatArray = np.zeros((n, 2))
+        self._start, self._goal = np.zeros((n, 2), dtype=np.int64), np.zeros((n, 2), dtype=np.int64)
+        self._goal_w: FloatArray = np.zeros((n, 2))
+        self._shortest_path_m: FloatArray = np.zeros(n)
+        # What the episode came to so far.
+        self._steps, self._collisions = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
+        self._path_length_m: FloatArray = np.zeros(n)
+        # What the last step did; every step writes these arrays anew.
+        self._travelled_m: FloatArray = np.zeros(n)
+        self._failed = np.zeros(n, dtype=bool)
+        self._transition = _still(n)
         self._fixed: dict[str, Any] = {}
         self._has_reset = False
 
@@ -136,26 +127,29 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
     def _use_layout(self) -> None:
         """Build what depends on ``self.layout``; worlds add their own."""
         self._features = FeatureVector(self.layout, self.robot)
+        self._lidar = Lidar(self.layout, self.robot)
+        self._sampler = EpisodeSampler(self.task, self.layout)
+        self._transition.duration[:] = self.step_duration
 
     @abstractmethod
     def _place(self, ids: IntArray) -> None:
-        """Put robots at rest where ``self._pose`` says, shape of ids ``(m,)``."""
+        """Put robots at rest where ``self._pose`` says, shape of ids ``(m,)``, and write their distance to the goal.
+
+        The distance, in cells, is ``self._transition.next_distance``.
+        """
 
     @abstractmethod
-    def _drive(self, actions: AnyArray) -> Motion:
-        """Move every robot for one step and update pose, speed and last action."""
+    def _drive(self, actions: AnyArray) -> None:
+        """Move every robot for one step.
+
+        Writes pose, cell, speed, last action, ``self._travelled_m`` and ``self._failed`` (the physics diverged; the
+        pose is then the last good one), and of the transition ``hit``, ``hit_inner_wall``, ``at_goal``,
+        ``next_distance`` and ``manhattan``.
+        """
 
     @abstractmethod
     def _valid(self, actions: AnyArray) -> AnyArray:
         """The actions as an array of the batch's shape; ValueError that names the action otherwise."""
-
-    @abstractmethod
-    def _distances(self, ids: IntArray | slice) -> FloatArray:
-        """Shortest way from where robots are to their goals, cells."""
-
-    @abstractmethod
-    def _arrived(self) -> BoolArray:
-        """Whether each robot is at its goal."""
 
     # ---- Gymnasium ---------------------------------------------------------------------------
 
@@ -179,10 +173,9 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
             self.layout = layout
             self._use_layout()
         self._fixed = fixed
-        ids = np.arange(self.num_envs)
-        self._begin(ids)
+        self._begin(np.arange(self.num_envs))
         self._has_reset = True
-        return self._observe(ids), self._info(_zero_terms(self.num_envs))
+        return self._observe(), self._info({name: np.zeros(self.num_envs) for name in TERM_NAMES})
 
     def step(self, actions: AnyArray) -> tuple[AnyArray, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
         """Drive every robot for one step.
@@ -193,39 +186,16 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         """
         if not self._has_reset:
             raise gym.error.ResetNeeded("call reset() before the first step()")
-        motion = self._drive(self._valid(actions))
-
-        self._steps += 1
-        self._hit, self._failed = motion.hit, motion.failed
-        self._collisions += motion.hit
-        self._path_length_m += motion.travelled_m
-        self._at_goal = self._arrived() & ~motion.failed
-        ends = motion.hit if self.task.on_collision == "end" else False
-        terminated = self._at_goal | motion.failed | ends
-        truncated = np.full(self.num_envs, False)
-        if self.max_episode_steps is not None:
-            truncated = self._steps >= self.max_episode_steps
-
-        distance, self._distance = self._distance, self._distances(slice(None))
-        terms = self.reward.terms(
-            Transition(
-                travelled=motion.travelled_m / self.layout.cell_size_m,
-                duration=np.full(self.num_envs, self.step_duration),
-                distance=distance,
-                next_distance=self._distance,
-                manhattan=np.abs(self._cell() - self._goal).sum(axis=1).astype(np.float64),
-                at_goal=self._at_goal,
-                hit=motion.hit,
-                hit_inner_wall=motion.hit_inner_wall,
-                terminal=self._at_goal | ends,  # not a failure of the physics: that must not pay
-                time_up=truncated,
-            )
-        )
-        observations, info = self._observe(np.arange(self.num_envs)), self._info(terms)
+        valid = self._valid(actions)
+        self._transition.distance[:] = self._transition.next_distance
+        self._drive(valid)
+        terminated, truncated = self._count()
+        terms = self.reward.terms(self._transition)
+        observations, info = self._observe(), self._info(terms)
         if self._autoreset:
             ended = np.flatnonzero(terminated | truncated)
             if ended.size:
-                observations, info = self._next_episodes(ended, observations, info)
+                info = self._next_episodes(ended, observations, info)
         return observations, total(terms), terminated, truncated, info
 
     @property
@@ -257,25 +227,46 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
 
     def _begin(self, ids: IntArray) -> None:
         """Start the next episode of the given environments; the others are not touched."""
-        starts, goals, headings = self.task.sample(self.layout, self._streams.draw(ids, DRAWS_PER_EPISODE))
-        goals = np.broadcast_to(self._fixed.get("goal", goals), goals.shape)
-        if "start" in self._fixed:
-            starts = np.broadcast_to(self._fixed["start"], starts.shape)
-        elif "goal" in self._fixed:
-            starts = self._other_start(starts, goals)
-        if "start" in self._fixed and "goal" not in self._fixed:
-            goals = self._other_goal(starts, goals)
-        self._start[ids], self._goal[ids] = starts, goals
-        self._goal_w[ids] = self.layout.to_metres(goals)
-        self._pose[ids, :2] = self.layout.to_metres(starts)
-        self._pose[ids, 2] = self._fixed.get("heading_rad", headings)
-        self._steps[ids] = self._collisions[ids] = 0
-        self._hit[ids] = self._at_goal[ids] = self._failed[ids] = False
-        self._path_length_m[ids] = 0.0
-        self._last_action[ids] = self._speed[ids] = 0.0
+        starts, goals, headings = self._sampler.sample(self._streams.draw(ids, DRAWS_PER_EPISODE))
+        if self._fixed:
+            starts, goals, headings = self._as_fixed(starts, goals, headings)
+        _begin(
+            ids,
+            starts,
+            goals,
+            headings,
+            self.layout.n_rows,
+            self.layout.cell_size_m,
+            self._start,
+            self._goal,
+            self._goal_w,
+            self._cell,
+            self._pose,
+            self._speed,
+            self._last_action,
+            self._steps,
+            self._collisions,
+            self._path_length_m,
+            self._failed,
+            self._transition.hit,
+            self._transition.at_goal,
+        )
         self._place(ids)
-        self._distance[ids] = self._distances(ids)
-        self._shortest_path_m[ids] = self._distance[ids] * self.layout.cell_size_m
+        self._shortest_path_m[ids] = self._transition.next_distance[ids] * self.layout.cell_size_m
+
+    def _as_fixed(
+        self, starts: IntArray, goals: IntArray, headings: FloatArray
+    ) -> tuple[IntArray, IntArray, FloatArray]:
+        """What was drawn, with what the reset's options fix."""
+        fixed = self._fixed
+        goals = np.broadcast_to(fixed.get("goal", goals), goals.shape)
+        if "start" in fixed:
+            starts = np.broadcast_to(fixed["start"], starts.shape)
+        elif "goal" in fixed:
+            starts = self._other_start(starts, goals)
+        if "start" in fixed and "goal" not in fixed:
+            goals = self._other_goal(starts, goals)
+        return starts, goals, np.broadcast_to(fixed.get("heading_rad", headings), headings.shape)
 
     def _other_start(self, starts: IntArray, goals: IntArray) -> IntArray:
         """The drawn starts, moved to the task's next start cell where the fixed goal took theirs."""
@@ -289,20 +280,48 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         cells = cells[(cells != starts[0]).any(axis=1)]
         return np.where((starts == goals).all(axis=1, keepdims=True), cells[0], goals)
 
-    def _next_episodes(
-        self, ended: IntArray, observations: AnyArray, info: dict[str, Any]
-    ) -> tuple[AnyArray, dict[str, Any]]:
-        """Autoreset in the same step: what ended goes to ``final_obs`` and ``final_info``."""
+    def _count(self) -> tuple[BoolArray, BoolArray]:
+        """Count the step into the episodes; which of them it terminated and which it truncated."""
+        step = self._transition
+        terminated, truncated = np.empty(self.num_envs, dtype=bool), np.empty(self.num_envs, dtype=bool)
+        _count(
+            self.task.on_collision == "end",
+            self.max_episode_steps or NO_LIMIT,
+            self.layout.cell_size_m,
+            self._travelled_m,
+            self._failed,
+            step.hit,
+            step.at_goal,
+            self._steps,
+            self._collisions,
+            self._path_length_m,
+            step.travelled,
+            step.terminal,
+            step.time_up,
+            terminated,
+            truncated,
+        )
+        return terminated, truncated
+
+    def _next_episodes(self, ended: IntArray, observations: AnyArray, info: dict[str, Any]) -> dict[str, Any]:
+        """Autoreset in the same step: what ended goes to ``final_obs`` and ``final_info``.
+
+        Writes the first observations of the next episodes into ``observations`` and returns their info.
+        """
         mask = np.zeros(self.num_envs, dtype=bool)
         mask[ended] = True
-        final_obs = np.full(self.num_envs, None, dtype=object)
-        for i in ended:
-            final_obs[i] = observations[i].copy()
+        final_obs = np.empty(self.num_envs, dtype=object)  # filled with None
+        if observations.ndim == 1:
+            final_obs[ended] = observations[ended]
+        else:
+            for i in ended:
+                final_obs[i] = observations[i].copy()
         self._begin(ended)
-        observations = observations.copy()
         observations[ended] = self._observe(ended)
-        terms = {name: np.where(mask, 0.0, values) for name, values in info["reward_terms"].items()}
-        return observations, self._info(terms) | {
+        terms = {name: share.copy() for name, share in info["reward_terms"].items()}
+        for share in terms.values():
+            share[ended] = 0.0
+        return self._info(terms) | {
             "final_obs": final_obs,
             "_final_obs": mask,
             "final_info": info,
@@ -311,31 +330,28 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
 
     # ---- What agents and people see ----------------------------------------------------------
 
-    def _observe(self, ids: IntArray) -> AnyArray:
-        """Observations of the given robots, a fresh array; the shared feature vector by default."""
-        return self._features.observe(
-            self._pose[ids], self.scan(ids), self._goal_w[ids], self._speed[ids], self._last_action[ids]
-        )
+    def _observe(self, ids: IntArray | None = None) -> AnyArray:
+        """Observations of the given robots (all by default), a fresh array; the shared feature vector by default."""
+        state = (self._pose, self._goal_w, self._speed, self._last_action)
+        pose, goal_w, speed, last_action = state if ids is None else (part[ids] for part in state)
+        return self._features.observe(pose, self._lidar.scan(pose), goal_w, speed, last_action)
 
-    def scan(self, ids: IntArray | None = None) -> FloatArray:
-        """Lidar ranges of the given robots (all by default), shape ``(m, n_beams)``, metres."""
-        return scan(self._pose if ids is None else self._pose[ids], self.layout, self.robot)
-
-    def _cell(self) -> IntArray:
-        return self.layout.to_cell(self._pose[:, :2])
+    def scan(self) -> FloatArray:
+        """Lidar ranges of all robots, shape ``(num_envs, n_beams)``, metres."""
+        return self._lidar.scan(self._pose)
 
     def _info(self, terms: dict[str, FloatArray]) -> dict[str, Any]:
-        """The contract's keys, each a fresh array with a leading batch axis."""
+        """The contract's keys, each a fresh array with a leading batch axis; the terms become part of it."""
         info: dict[str, Any] = {
-            "is_success": self._at_goal.copy(),
-            "collision": self._hit.copy(),
+            "is_success": self._transition.at_goal.copy(),
+            "collision": self._transition.hit.copy(),
             "collisions": self._collisions.copy(),
             "path_length_m": self._path_length_m.copy(),
             "shortest_path_m": self._shortest_path_m.copy(),
             "elapsed_s": self._steps * self.step_s,
-            "cell": self._cell(),
+            "cell": self._cell.copy(),
             "pose": self._pose.copy(),
-            "reward_terms": {name: terms[name].copy() for name in TERM_NAMES},
+            "reward_terms": terms,
         }
         if self._failed.any():
             info["physics_error"] = self._failed.copy()
@@ -391,107 +407,90 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         return [np.random.default_rng(one) for one in seed]
 
 
-class RandomStreams:
-    """One stream of uniform numbers per environment, drawn in blocks so that a batch costs no Python loop.
-
-    Environment i sees the numbers its generator would give one by one, whatever the others do.
-    """
-
-    BLOCK = 64
-
-    def __init__(self, generators: list[np.random.Generator]) -> None:
-        self.generators = generators
-        self._block = np.empty((len(generators), self.BLOCK))
-        self._next = np.full(len(generators), self.BLOCK)
-
-    def draw(self, ids: IntArray, n: int) -> FloatArray:
-        """The next ``n`` numbers in [0, 1) of the given streams, shape ``(len(ids), n)``."""
-        for i in ids[self._next[ids] + n > self.BLOCK]:
-            unused = self._block[i, self._next[i] :]
-            fresh = self.generators[i].random(self.BLOCK - unused.size)
-            self._block[i] = np.concatenate([unused, fresh])
-            self._next[i] = 0
-        columns = self._next[ids][:, None] + np.arange(n)
-        self._next[ids] += n
-        return self._block[ids[:, None], columns]
+NO_LIMIT = np.iinfo(np.int64).max
 
 
-VectorWorld = TypeVar("VectorWorld", bound=NavigationVectorEnv)
+def _still(n: int) -> Transition:
+    """A transition of ``n`` worlds in which nothing happens."""
+    numbers: Any = [np.zeros(n) for _ in range(5)]
+    facts: Any = [np.zeros(n, dtype=bool) for _ in range(5)]
+    return Transition(*numbers, *facts)
 
 
-class NavigationEnv(gym.Env[Any, Any], Generic[VectorWorld]):
-    """One robot: the world's vector form with a batch of one, without its batch axis."""
-
-    def __init__(self, world: VectorWorld) -> None:
-        self.worlds = world
-        """The vector form with a batch of one."""
-        self.observation_space = world.single_observation_space
-        self.action_space = world.single_action_space
-        self.render_mode = world.render_mode
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start an episode; see ``NavigationVectorEnv.reset``."""
-        self.worlds._checked_options(options)  # before the seed changes anything
-        super().reset(seed=seed)
-        limit = _time_limit_around(self)
-        if limit is not None:
-            self.worlds.max_episode_steps = limit
-        self.worlds.use_generators([self.np_random])
-        observations, info = self.worlds.reset(options=options)
-        if self.render_mode == "human":  # Gymnasium's convention: the window needs no call
-            self.render()
-        return _one(observations), _one_info(info)
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Drive for one step; see ``NavigationVectorEnv.step``."""
-        observations, rewards, terminated, truncated, info = self.worlds.step(as_array(action)[None])
-        if self.render_mode == "human":
-            self.render()
-        return _one(observations), float(rewards[0]), bool(terminated[0]), bool(truncated[0]), _one_info(info)
-
-    def render(self) -> Any:
-        """A picture of the world in the form of ``render_mode``."""
-        pictures = self.worlds.render()
-        return pictures[0] if pictures else None
-
-    def close(self) -> None:
-        """Release windows and graphics."""
-        self.worlds.close()
-
-    @property
-    def features(self) -> FeatureVector:
-        """Names, units and bounds of the shared feature vector."""
-        return self.worlds.features
-
-    @property
-    def layout(self) -> Layout:
-        """The maze of the current episode."""
-        return self.worlds.layout
-
-    @property
-    def task(self) -> Task:
-        """The task."""
-        return self.worlds.task
-
-    @property
-    def reward(self) -> Reward:
-        """The reward."""
-        return self.worlds.reward
+@numba.njit(cache=True)
+def _count(
+    ends_at_hit: bool,
+    max_steps: int,
+    cell_size_m: float,
+    travelled_m: FloatArray,
+    failed: BoolArray,
+    hit: BoolArray,
+    at_goal: BoolArray,
+    steps: IntArray,
+    collisions: IntArray,
+    path_length_m: FloatArray,
+    travelled: FloatArray,
+    terminal: BoolArray,
+    time_up: BoolArray,
+    terminated: BoolArray,
+    truncated: BoolArray,
+) -> None:
+    # One loop per array, so that each compiles to vector instructions.
+    n = len(steps)
+    for i in range(n):
+        steps[i] += 1
+    for i in range(n):
+        collisions[i] += hit[i]
+    for i in range(n):
+        path_length_m[i] += travelled_m[i]
+    for i in range(n):
+        travelled[i] = travelled_m[i] / cell_size_m
+    for i in range(n):
+        at_goal[i] &= not failed[i]
+        # A failure of the physics ends the episode, but is no final state of the task: that must not pay.
+        terminal[i] = at_goal[i] | (ends_at_hit & hit[i])
+        terminated[i] = terminal[i] | failed[i]
+    for i in range(n):
+        time_up[i] = steps[i] >= max_steps
+    for i in range(n):
+        truncated[i] = time_up[i]
 
 
-def _time_limit_around(env: gym.Env[Any, Any]) -> int | None:
-    """The limit of Gymnasium's ``TimeLimit`` around an environment that is being reset, or none.
-
-    ``gym.make`` keeps the limit to the wrapper and tells the environment nothing, but a reward may look at the last
-    move. The wrapper is found where it stands: among the callers of ``reset``.
-    """
-    frame = inspect.currentframe()
-    while frame is not None:
-        caller = frame.f_locals.get("self")
-        if isinstance(caller, gym.wrappers.TimeLimit) and caller.unwrapped is env:
-            return caller._max_episode_steps
-        frame = frame.f_back
-    return None
+@numba.njit(cache=True)
+def _begin(
+    ids: IntArray,
+    starts: IntArray,
+    goals: IntArray,
+    headings: FloatArray,
+    n_rows: int,
+    cell_size_m: float,
+    start: IntArray,
+    goal: IntArray,
+    goal_w: FloatArray,
+    cell: IntArray,
+    pose: FloatArray,
+    speed: FloatArray,
+    last_action: FloatArray,
+    steps: IntArray,
+    collisions: IntArray,
+    path_length_m: FloatArray,
+    failed: BoolArray,
+    hit: BoolArray,
+    at_goal: BoolArray,
+) -> None:
+    for k in range(len(ids)):
+        i = ids[k]
+        for axis in range(2):
+            start[i, axis] = cell[i, axis] = starts[k, axis]
+            goal[i, axis] = goals[k, axis]
+            speed[i, axis] = last_action[i, axis] = 0.0
+        # Cell centres, as in `Layout.to_metres`.
+        pose[i, 0], pose[i, 1] = (starts[k, 1] + 0.5) * cell_size_m, (n_rows - starts[k, 0] - 0.5) * cell_size_m
+        goal_w[i, 0], goal_w[i, 1] = (goals[k, 1] + 0.5) * cell_size_m, (n_rows - goals[k, 0] - 0.5) * cell_size_m
+        pose[i, 2] = headings[k]
+        steps[i] = collisions[i] = 0
+        path_length_m[i] = 0.0
+        failed[i] = hit[i] = at_goal[i] = False
 
 
 def as_array(action: Any) -> AnyArray:
@@ -500,30 +499,6 @@ def as_array(action: Any) -> AnyArray:
         return np.asarray(action)
     except (ValueError, TypeError):
         raise InputError(f"action {action!r} is not an array of numbers") from None
-
-
-def _one(observations: AnyArray) -> Any:
-    # A Discrete observation is a plain integer, as Gymnasium's own environments return it.
-    return observations[0].copy() if observations.ndim > 1 else int(observations[0])
-
-
-def _one_info(info: dict[str, Any]) -> dict[str, Any]:
-    """The first environment's entries as Python values: numbers, a cell tuple, a pose array."""
-    one: dict[str, Any] = {}
-    for key, value in info.items():
-        if key.startswith("_"):
-            continue
-        if isinstance(value, dict):
-            one[key] = _one_info(value)
-        elif value.ndim == 1:
-            one[key] = value[0].item()
-        else:
-            one[key] = tuple(value[0].tolist()) if key == "cell" else value[0].copy()
-    return one
-
-
-def _zero_terms(n: int) -> dict[str, FloatArray]:
-    return {name: np.zeros(n) for name in TERM_NAMES}
 
 
 def _free_cell(value: Any, key: str, layout: Layout) -> Cell:

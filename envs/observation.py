@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
@@ -51,6 +52,9 @@ class FeatureVector:
         ends = np.cumsum([feature.size for feature in self.features]).tolist()
         self.slices = {f.name: slice(end - f.size, end) for f, end in zip(self.features, ends, strict=True)}
 
+        width, height = layout.size_m
+        self._scales = (width / 2, height / 2, robot.lidar_range_m)
+
     @property
     def space(self) -> Box:
         """Bounds of the vector, shape ``(35,)`` with 24 beams."""
@@ -73,23 +77,9 @@ class FeatureVector:
         Returns:
             Shape ``(n, 35)`` with 24 beams; a fresh array.
         """
-        to_goal = goals_w - poses[:, :2]
-        heading = poses[:, 2]
-        bearing = np.arctan2(to_goal[:, 1], to_goal[:, 0]) - heading
-        half = np.asarray(self._layout.size_m) / 2
-        lidar_range = self._robot.lidar_range_m
-        parts = [
-            ranges_m / lidar_range,
-            np.hypot(to_goal[:, 0], to_goal[:, 1])[:, None] / lidar_range,
-            np.cos(bearing)[:, None],
-            np.sin(bearing)[:, None],
-            poses[:, :2] / half - 1.0,
-            np.cos(heading)[:, None],
-            np.sin(heading)[:, None],
-            np.clip(speeds, -1.5, 1.5),
-            last_actions,
-        ]
-        return np.concatenate(parts, axis=1).astype(np.float32)
+        observations = np.empty((len(poses), self.slices["last_action"].stop), dtype=np.float32)
+        _fill(poses, ranges_m, goals_w, speeds, last_actions, *self._scales, observations)
+        return observations
 
     def poses_and_goals(self, observations: NDArray[np.float32]) -> tuple[FloatArray, FloatArray]:
         """Poses and goal centres that feature vectors stand for, for controllers that steer by them.
@@ -107,3 +97,32 @@ class FeatureVector:
         distance = part["goal_distance"] * self._robot.lidar_range_m
         goals = position + distance * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
         return np.column_stack([position, heading]), goals
+
+
+@numba.njit(cache=True)
+def _fill(
+    poses: FloatArray,
+    ranges_m: FloatArray,
+    goals_w: FloatArray,
+    speeds: FloatArray,
+    last_actions: FloatArray,
+    half_width: float,
+    half_height: float,
+    lidar_range: float,
+    out: NDArray[np.float32],
+) -> None:
+    """The slices in the order of ``FeatureVector.features``."""
+    n_beams = ranges_m.shape[1]
+    for i in range(len(poses)):
+        x, y, heading = poses[i, 0], poses[i, 1], poses[i, 2]
+        dx, dy = goals_w[i, 0] - x, goals_w[i, 1] - y
+        bearing = np.arctan2(dy, dx) - heading
+        for k in range(n_beams):
+            out[i, k] = ranges_m[i, k] / lidar_range
+        out[i, n_beams] = np.hypot(dx, dy) / lidar_range
+        out[i, n_beams + 1], out[i, n_beams + 2] = np.cos(bearing), np.sin(bearing)
+        out[i, n_beams + 3], out[i, n_beams + 4] = x / half_width - 1.0, y / half_height - 1.0
+        out[i, n_beams + 5], out[i, n_beams + 6] = np.cos(heading), np.sin(heading)
+        for k in range(2):
+            out[i, n_beams + 7 + k] = min(max(speeds[i, k], -1.5), 1.5)
+            out[i, n_beams + 9 + k] = last_actions[i, k]

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import Any
 
 import gymnasium as gym
+import numba
 import numpy as np
 from gymnasium.spaces import Box
 
 from gridnav.problem.geodesic import Geodesic
 from gridnav.problem.types import AnyArray, BoolArray, FloatArray, InputError, IntArray
 
-from .navigation import Motion, NavigationEnv, NavigationVectorEnv, VectorWorld, as_array
+from .navigation import NavigationVectorEnv, as_array
+from .single import NavigationEnv, VectorWorld
 
 RELEASE_M = 0.01
 """A contact is over once the bumper is this far from the wall: until then it is counted and charged once."""
@@ -49,41 +52,60 @@ class RobotVectorEnv(NavigationVectorEnv):
     def _use_layout(self) -> None:
         super()._use_layout()
         self._geodesic = Geodesic(self.layout, self.robot.radius_m)
-        self._goal_number = np.zeros(self.num_envs, dtype=np.int64)
+        n = self.num_envs
+        self._goal_number = np.zeros(n, dtype=np.int64)
         # Direction of the wall that the bumper met last and has not left, zero without one.
-        self._contact: FloatArray = np.zeros((self.num_envs, 2))
-        self._contact_is_inner = np.zeros(self.num_envs, dtype=bool)
-        self._pressed_s: FloatArray = np.zeros(self.num_envs)
+        self._contact: FloatArray = np.zeros((n, 2))
+        self._contact_is_inner = np.zeros(n, dtype=bool)
+        self._pressed_s: FloatArray = np.zeros(n)
+        # Of the last step: a contact began (or, sliding, went on), and a command into the wall was refused.
+        self._begins, self._refused = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
 
     def _place(self, ids: IntArray) -> None:
-        for i in ids:
-            row, col = self._goal[i].tolist()
-            self._goal_number[i] = self._geodesic.goal_number((row, col))
+        self._goal_number[ids] = self._geodesic.goal_numbers(self._goal[ids])
         self._contact[ids] = 0.0
         self._pressed_s[ids] = 0.0
+        self._transition.next_distance[ids] = self._distances(self._pose[ids], self._goal_number[ids])
 
-    def _motion(self, travelled: FloatArray, begins: BoolArray, refused: BoolArray, failed: BoolArray) -> Motion:
-        """What a period did, with another collision for every cell-time of pressing against a wall.
+    def _drive(self, actions: AnyArray) -> None:
+        self._begins[:] = self._refused[:] = False
+        self._travelled_m[:] = 0.0
+        self._roll(actions)
+        self._last_action = actions
+        step = self._transition
+        _judge(
+            self.layout.walls.shape,
+            self.layout.cell_size_m,
+            self.task.goal_radius_m,
+            self.control_period_s,
+            self.layout.cell_size_m / self.robot.max_speed_m_s,
+            self._pose,
+            self._goal_w,
+            self._goal,
+            self._begins,
+            self._refused,
+            self._contact_is_inner,
+            self._failed,
+            self._pressed_s,
+            self._travelled_m,
+            self._cell,
+            step.hit,
+            step.hit_inner_wall,
+            step.at_goal,
+            step.manhattan,
+        )
+        step.next_distance[:] = self._distances(self._pose, self._goal_number)
 
-        Args:
-            travelled: Metres, shape ``(n,)``.
-            begins: A contact began (or, sliding, went on), shape ``(n,)``.
-            refused: A command into the wall was refused, shape ``(n,)``.
-            failed: The physics diverged, shape ``(n,)``.
+    @abstractmethod
+    def _roll(self, actions: FloatArray) -> None:
+        """Drive for one control period.
+
+        Writes pose, speed, ``self._travelled_m``, ``self._begins``, ``self._refused``, ``self._contact``,
+        ``self._contact_is_inner`` and ``self._failed``; the last may hold what it was, the others are zero before.
         """
-        self._pressed_s = np.where(refused & ~begins, self._pressed_s + self.control_period_s, 0.0)
-        again = self._pressed_s >= self.layout.cell_size_m / self.robot.max_speed_m_s
-        self._pressed_s[again] = 0.0
-        hit = (begins | again) & ~failed
-        return Motion(np.where(failed, 0.0, travelled), hit, hit & self._contact_is_inner, failed)
 
-    def _distances(self, ids: IntArray | slice) -> FloatArray:
-        return self._geodesic.distances(self._pose[ids, :2], self._goal_number[ids]) / self.layout.cell_size_m
-
-    def _arrived(self) -> BoolArray:
-        gap = self._pose[:, :2] - self._goal_w
-        arrived: BoolArray = np.hypot(gap[:, 0], gap[:, 1]) <= self.task.goal_radius_m
-        return arrived
+    def _distances(self, poses: FloatArray, goal_numbers: IntArray) -> FloatArray:
+        return self._geodesic.distances(poses, goal_numbers) / self.layout.cell_size_m
 
     def _valid(self, actions: AnyArray) -> AnyArray:
         array = as_array(actions)
@@ -94,7 +116,7 @@ class RobotVectorEnv(NavigationVectorEnv):
         if not np.isfinite(array).all():
             raise InputError(f"action {array[~np.isfinite(array).all(axis=1)][0].tolist()} must be finite numbers")
         # Beyond the box a command means full speed: a robot's firmware clips it too.
-        return np.clip(array.astype(np.float64), -1.0, 1.0)
+        return np.minimum(np.maximum(array.astype(np.float64), -1.0), 1.0)
 
 
 class RobotEnv(NavigationEnv[VectorWorld]):
@@ -108,14 +130,41 @@ class RobotEnv(NavigationEnv[VectorWorld]):
         return float(self.worlds.control_period_s)
 
 
-def towards(direction: FloatArray, headings: FloatArray, forward: FloatArray) -> BoolArray:
-    """Whether commands drive into what lies in a direction.
-
-    Args:
-        direction: Unit vectors, world frame, shape ``(n, 2)``.
-        headings: Radians, shape ``(n,)``.
-        forward: Forward commands, negative for backwards, shape ``(n,)``.
-    """
-    along = forward * (direction[:, 0] * np.cos(headings) + direction[:, 1] * np.sin(headings))
-    into: BoolArray = along > 1e-3
-    return into
+@numba.njit(cache=True)
+def _judge(
+    shape: tuple[int, int],
+    cell_size_m: float,
+    goal_radius_m: float,
+    period_s: float,
+    cell_time_s: float,
+    pose: FloatArray,
+    goal_w: FloatArray,
+    goal: IntArray,
+    begins: BoolArray,
+    refused: BoolArray,
+    contact_is_inner: BoolArray,
+    failed: BoolArray,
+    pressed_s: FloatArray,
+    travelled_m: FloatArray,
+    cell: IntArray,
+    hit: BoolArray,
+    hit_inner_wall: BoolArray,
+    at_goal: BoolArray,
+    manhattan: FloatArray,
+) -> None:
+    """What a period came to: collisions, one more for every cell-time of pressing, the cell, and arrival."""
+    n_rows, n_cols = shape
+    for i in range(len(pose)):
+        pressed_s[i] = pressed_s[i] + period_s if refused[i] and not begins[i] else 0.0
+        again = pressed_s[i] >= cell_time_s
+        if again:
+            pressed_s[i] = 0.0
+        hit[i] = (begins[i] or again) and not failed[i]
+        hit_inner_wall[i] = hit[i] and contact_is_inner[i]
+        if failed[i]:
+            travelled_m[i] = 0.0
+        row = n_rows - 1 - int(np.floor(pose[i, 1] / cell_size_m))
+        col = int(np.floor(pose[i, 0] / cell_size_m))
+        cell[i, 0], cell[i, 1] = min(max(row, 0), n_rows - 1), min(max(col, 0), n_cols - 1)
+        manhattan[i] = abs(cell[i, 0] - goal[i, 0]) + abs(cell[i, 1] - goal[i, 1])
+        at_goal[i] = np.hypot(pose[i, 0] - goal_w[i, 0], pose[i, 1] - goal_w[i, 1]) <= goal_radius_m

@@ -9,9 +9,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from gridnav.problem.geodesic import clearance
-from gridnav.problem.types import AnyArray, BoolArray, FloatArray
+from gridnav.problem.types import BoolArray, FloatArray
 
-from .navigation import Motion
 from .painter import Painter
 from .robot_world import RELEASE_M, SAME_WALL, RobotEnv, RobotVectorEnv
 
@@ -33,33 +32,25 @@ class UnicycleVectorEnv(RobotVectorEnv):
         self._painter: Painter | None = None
         super().__init__(num_envs, **shared)
 
-    def _drive(self, actions: AnyArray) -> Motion:
-        wheels = self.robot.wheel_fractions(actions)
-        forward, turn = wheels.mean(axis=1), (wheels[:, 1] - wheels[:, 0]) / 2
-        travelled = np.zeros(self.num_envs)
-        begins, refused, failed = (np.zeros(self.num_envs, dtype=bool) for _ in range(3))
-        heading = self._pose[:, 2].copy()
+    def _roll(self, actions: FloatArray) -> None:
+        robot = self.robot
         _roll(
             self._pose,
-            forward * self.robot.max_speed_m_s,
-            turn * self.robot.max_turn_rad_s,
+            robot.wheel_fractions(actions),
+            robot.max_speed_m_s,
+            robot.max_turn_rad_s,
             self.control_period_s,
-            self.robot.radius_m,
+            robot.radius_m,
             self.task.on_collision == "slide",
             self.layout.walls,
             self.layout.cell_size_m,
             self._contact,
             self._contact_is_inner,
-            travelled,
-            begins,
-            refused,
+            self._travelled_m,
+            self._begins,
+            self._refused,
+            self._speed,
         )
-        turned = self._pose[:, 2] - heading
-        self._pose[:, 2] = (self._pose[:, 2] + np.pi) % (2 * np.pi) - np.pi
-        self._speed[:, 0] = np.copysign(travelled, forward) / (self.control_period_s * self.robot.max_speed_m_s)
-        self._speed[:, 1] = turned / (self.control_period_s * self.robot.max_turn_rad_s)
-        self._last_action = actions
-        return self._motion(travelled, begins, refused, failed)
 
     def render(self) -> tuple[Any, ...] | None:
         """A picture per environment; the window of ``human`` shows the first."""
@@ -122,8 +113,9 @@ class UnicycleEnv(RobotEnv[UnicycleVectorEnv]):
 @numba.njit(cache=False)
 def _roll(
     poses: FloatArray,
-    speeds: FloatArray,
-    turns: FloatArray,
+    wheels: FloatArray,
+    max_speed: float,
+    max_turn: float,
     period: float,
     radius: float,
     slides: bool,
@@ -134,12 +126,14 @@ def _roll(
     travelled: FloatArray,
     begins: BoolArray,
     refused: BoolArray,
+    speeds: FloatArray,
 ) -> None:
     """Constant-twist arcs (Siegwart et al. 2011, section 3.2.3), without their forward part at a wall."""
     n_substeps = int(np.ceil(period / SUBSTEP_S - 1e-9))
     for i in range(len(poses)):
         x, y, heading = poses[i]
-        speed, turn = speeds[i], turns[i]
+        forward, turning = (wheels[i, 0] + wheels[i, 1]) / 2, (wheels[i, 1] - wheels[i, 0]) / 2
+        speed, turn = forward * max_speed, turning * max_turn
         # Far from walls one arc does; near them, short ones that look for contact.
         gap, _, _, _ = clearance(x, y, walls, cell)
         n = 1 if gap - radius > abs(speed) * period + RELEASE_M else n_substeps
@@ -166,4 +160,6 @@ def _roll(
                 contact[i, 0] = contact[i, 1] = 0.0
             travelled[i] += way
             x, y, heading = to_x, to_y, heading + turned
-        poses[i, 0], poses[i, 1], poses[i, 2] = x, y, heading
+        poses[i, 0], poses[i, 1], poses[i, 2] = x, y, (heading + np.pi) % (2 * np.pi) - np.pi
+        speeds[i, 0] = np.copysign(travelled[i], forward) / (period * max_speed)
+        speeds[i, 1] = turning

@@ -268,7 +268,7 @@ def test_time_and_way_add_up(env_id: str) -> None:
         assert info["elapsed_s"] == pytest.approx(number * seconds)
         assert info["collisions"] == hits
         # Arcs are longer than the chords between poses, by at most x 1.011 for 0.5 rad per step (a/2 / sin(a/2)).
-        assert way - 1e-9 <= info["path_length_m"] <= way * 1.02 + 2e-3
+        assert way - 1e-9 <= info["path_length_m"] <= way * 1.02 + 4e-3
 
 
 @pytest.mark.parametrize("reward", ["default", "seed"])

@@ -43,6 +43,10 @@ def cell_distances(layout: Layout, goal: Cell) -> FloatArray:
     return moves.reshape(layout.walls.shape)
 
 
+MAX_SIGHT_TESTS = 200_000_000
+"""Larger mazes do without the list of anchors in sight of each cell: it would take longer to make than it saves."""
+
+
 class Geodesic:
     """Shortest way of a disc from any point of a layout to the centres of its cells.
 
@@ -62,16 +66,28 @@ class Geodesic:
         self.layout = layout
         self.radius_m = radius_m
         self._anchors = _anchors(layout, radius_m)
+        self._in_sight, self._first = _in_sight(layout, self._anchors)
         self._graph = self._visible_lengths(self._anchors)
         self._goals = np.empty((0, 2))
         self._costs = np.empty((0, len(self._anchors)))
-        self._goal_numbers: dict[Cell, int] = {}
+        self._number_of_cell = np.full(layout.walls.shape, -1)
+
+    def goal_numbers(self, goals: IntArray) -> IntArray:
+        """Numbers under which ``distances`` knows goals; each is worked out at its first use.
+
+        Args:
+            goals: Free cells, (row, column), shape ``(n, 2)``.
+        """
+        numbers = self._number_of_cell[goals[:, 0], goals[:, 1]]
+        if (numbers < 0).any():
+            for row, col in np.unique(goals[numbers < 0], axis=0).tolist():
+                self._add_goal((row, col))
+            numbers = self._number_of_cell[goals[:, 0], goals[:, 1]]
+        return numbers
 
     def goal_number(self, goal: Cell) -> int:
-        """Number under which ``distances`` knows the goal, a free cell; worked out at its first use."""
-        if goal not in self._goal_numbers:
-            self._add_goal(goal)
-        return self._goal_numbers[goal]
+        """``goal_numbers`` of one cell."""
+        return int(self.goal_numbers(np.array([goal]))[0])
 
     def distances(self, points_w: FloatArray, goal_numbers: IntArray) -> FloatArray:
         """Length of the shortest way of the disc's centre to each point's goal.
@@ -80,18 +96,20 @@ class Geodesic:
         keep its distance, so the length stays finite and continuous there.
 
         Args:
-            points_w: Shape ``(n, 2)``, metres, world frame, outside the walls.
-            goal_numbers: From ``goal_number``, shape ``(n,)``.
+            points_w: x and y in metres, world frame, outside the walls, shape ``(n, 2)``; more columns do not matter.
+            goal_numbers: From ``goal_numbers``, shape ``(n,)``.
 
         Returns:
             Shape ``(n,)``, metres; infinite where no way leads.
         """
         out = np.empty(len(points_w))
         _shortest(
-            np.ascontiguousarray(points_w, dtype=np.float64),
+            points_w,
             goal_numbers,
             self._goals,
             self._anchors,
+            self._in_sight,
+            self._first,
             self._costs,
             self.layout.walls,
             self.layout.cell_size_m,
@@ -115,7 +133,7 @@ class Geodesic:
         lengths[:n, n] = lengths[n, :n]
         lengths[~np.isfinite(lengths)] = 0.0  # csgraph reads a zero of a dense matrix as "no edge"
         costs = csgraph.dijkstra(csr_array(lengths), directed=False, indices=n)[:n]
-        self._goal_numbers[goal] = len(self._goals)
+        self._number_of_cell[goal] = len(self._goals)
         self._goals = np.concatenate([self._goals, goal_w[None]])
         self._costs = np.concatenate([self._costs, costs[None]])
 
@@ -134,7 +152,7 @@ def clearances(points_w: FloatArray, layout: Layout) -> tuple[FloatArray, FloatA
     Only walls within one cell of the point's own are looked at: beyond, the distance reads one cell.
 
     Args:
-        points_w: Shape ``(n, 2)``, metres, world frame.
+        points_w: x and y in metres, world frame, shape ``(n, 2)``; more columns do not matter.
         layout: The maze.
 
     Returns:
@@ -143,7 +161,7 @@ def clearances(points_w: FloatArray, layout: Layout) -> tuple[FloatArray, FloatA
     """
     n = len(points_w)
     distance, direction, inner = np.empty(n), np.empty((n, 2)), np.empty(n, dtype=np.bool_)
-    _clearances(np.ascontiguousarray(points_w), layout.walls, layout.cell_size_m, distance, direction, inner)
+    _clearances(points_w, layout.walls, layout.cell_size_m, distance, direction, inner)
     return distance, direction, inner
 
 
@@ -168,12 +186,68 @@ def _anchors(layout: Layout, radius_m: float) -> FloatArray:
     return np.ascontiguousarray(anchors[distance >= radius_m - TOLERANCE_M])
 
 
+def _in_sight(layout: Layout, anchors: FloatArray) -> tuple[IntArray, IntArray]:
+    """Anchors that may be seen from somewhere in each cell: a query need not look at the others.
+
+    Returns:
+        Numbers of anchors, cell after cell, shape ``(n,)``, and where in them each cell's begin, ``(n_cells + 1,)``.
+    """
+    rectangles = layout.wall_rectangles()
+    hidden = np.zeros((layout.n_cells, len(anchors)), dtype=np.bool_)
+    if hidden.size * len(rectangles) <= MAX_SIGHT_TESTS:
+        _hide(anchors, rectangles, layout.n_rows, layout.n_cols, layout.cell_size_m, hidden)
+    cells, numbers = np.nonzero(~hidden)
+    return numbers, np.searchsorted(cells, np.arange(layout.n_cells + 1))
+
+
+@numba.njit(cache=True)
+def _hide(
+    anchors: FloatArray, rectangles: FloatArray, n_rows: int, n_cols: int, cell: float, hidden: BoolArray
+) -> None:
+    """Mark the anchors that one wall hides from a whole cell.
+
+    What a convex wall hides from a point is convex, so a cell lies in it if its four corners do.
+    """
+    for number in range(n_rows * n_cols):
+        left, bottom = (number % n_cols) * cell, (n_rows - 1 - number // n_cols) * cell
+        for k in range(len(anchors)):
+            for r in range(len(rectangles)):
+                corner = 0
+                while corner < 4:
+                    x, y = left + (corner % 2) * cell, bottom + (corner // 2) * cell
+                    if not _crosses(anchors[k, 0], anchors[k, 1], x, y, rectangles[r]):
+                        break
+                    corner += 1
+                if corner == 4:
+                    hidden[number, k] = True
+                    break
+
+
+@numba.njit(cache=True)
+def _crosses(ax: float, ay: float, bx: float, by: float, rectangle: FloatArray) -> bool:
+    """Whether a segment meets a rectangle of x_min, y_min, x_max, y_max."""
+    enter, leave = 0.0, 1.0
+    for start, step, low, high in (
+        (ax, bx - ax, rectangle[0], rectangle[2]),
+        (ay, by - ay, rectangle[1], rectangle[3]),
+    ):
+        if step == 0.0:
+            if start < low or start > high:
+                return False
+        else:
+            t0, t1 = (low - start) / step, (high - start) / step
+            enter, leave = max(enter, min(t0, t1)), min(leave, max(t0, t1))
+    return enter <= leave
+
+
 @numba.njit(cache=True)
 def _shortest(
     points: FloatArray,
     goal_numbers: IntArray,
     goals: FloatArray,
     anchors: FloatArray,
+    in_sight: IntArray,
+    first: IntArray,
     costs: FloatArray,
     walls: BoolArray,
     cell: float,
@@ -181,24 +255,33 @@ def _shortest(
     out: FloatArray,
 ) -> None:
     """Best first over the anchors: the first one in sight, in order of total length, is the answer."""
-    n_anchors = len(anchors)
-    totals = np.empty(n_anchors + 1)
+    n_rows, n_cols = walls.shape
+    totals = np.empty(len(anchors) + 1)
     for i in range(len(points)):
-        x, y = points[i]
+        x, y = points[i, 0], points[i, 1]
         # A robot nearer to a wall than its radius may keep its distance. And where it touches a corner, it sees the
         # points around only through a sliver of the corner's arc.
         slim = min(radius, clearance(x, y, walls, cell)[0] / ANCHOR_REACH)
         goal = goals[goal_numbers[i]]
         cost = costs[goal_numbers[i]]
-        for k in range(n_anchors):
-            totals[k] = np.hypot(anchors[k, 0] - x, anchors[k, 1] - y) + cost[k]
-        totals[n_anchors] = np.hypot(goal[0] - x, goal[1] - y)
+        col = min(max(int(np.floor(x / cell)), 0), n_cols - 1)
+        row = n_rows - 1 - min(max(int(np.floor(y / cell)), 0), n_rows - 1)
+        near = in_sight[first[row * n_cols + col] : first[row * n_cols + col + 1]]
+        n = len(near)
+        for k in range(n):
+            # Not hypot: its care for huge numbers costs more than all the rest.
+            dx, dy = anchors[near[k], 0] - x, anchors[near[k], 1] - y
+            totals[k] = np.sqrt(dx * dx + dy * dy) + cost[near[k]]
+        totals[n] = np.sqrt((goal[0] - x) ** 2 + (goal[1] - y) ** 2)
         out[i] = np.inf
         while True:
-            k = int(np.argmin(totals))
-            if not np.isfinite(totals[k]):
+            k = n
+            for j in range(n):
+                if totals[j] < totals[k]:
+                    k = j
+            if totals[k] == np.inf:
                 break
-            to_x, to_y = (goal[0], goal[1]) if k == n_anchors else (anchors[k, 0], anchors[k, 1])
+            to_x, to_y = (goal[0], goal[1]) if k == n else (anchors[near[k], 0], anchors[near[k], 1])
             if _sees(x, y, to_x, to_y, walls, cell, slim):
                 out[i] = totals[k]
                 break

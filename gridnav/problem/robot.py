@@ -60,7 +60,8 @@ class Robot:
             Left and right wheel speed as fractions of the maximum, shape ``(n, 2)``, in [-1, 1].
         """
         forward, turn = actions[:, 0], actions[:, 1]
-        return np.clip(np.stack([forward - turn, forward + turn], axis=1), -1.0, 1.0)
+        wheels = np.stack([forward - turn, forward + turn], axis=1)
+        return np.minimum(np.maximum(wheels, -1.0), 1.0)
 
 
 BURGER = Robot()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import numba
 import numpy as np
 
 from gridnav.problem.layout import Layout
@@ -64,29 +65,61 @@ class Task:
         return np.argwhere(layout.reachable) if self.goals == "any" else layout.goal_cells
 
     def sample(self, layout: Layout, uniforms: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
+        """Starts, goals and headings of episodes; see ``EpisodeSampler.sample``."""
+        return EpisodeSampler(self, layout).sample(uniforms)
+
+
+class EpisodeSampler:
+    """Draws where the episodes of a task start and end.
+
+    Args:
+        task: The task.
+        layout: The maze.
+    """
+
+    def __init__(self, task: Task, layout: Layout) -> None:
+        self._starts, self._goals = task.start_cells(layout), task.goal_cells(layout)
+        if len(self._goals) == 1:  # a start that leaves no goal to go to is none
+            self._starts = self._starts[(self._starts != self._goals[0]).any(axis=1)]
+        self._goal_rank = np.full(layout.walls.shape, len(self._goals))
+        self._goal_rank[tuple(self._goals.T)] = np.arange(len(self._goals))
+
+    def sample(self, uniforms: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
         """Starts, goals and headings of episodes.
 
         Args:
-            layout: The maze.
             uniforms: Numbers in [0, 1) from one generator, shape ``(n, DRAWS_PER_EPISODE)``.
 
         Returns:
             Start cells ``(n, 2)``, goal cells ``(n, 2)``, never the start, and headings ``(n,)`` in radians.
         """
-        starts, goals = self.start_cells(layout), self.goal_cells(layout)
-        # Start: uniform over the start cells that leave a goal to go to.
-        if len(goals) == 1:
-            starts = starts[(starts != goals[0]).any(axis=1)]
-        start = starts[(uniforms[:, 0] * len(starts)).astype(np.int64)]
+        n = len(uniforms)
+        starts, goals, headings = np.empty((n, 2), dtype=np.int64), np.empty((n, 2), dtype=np.int64), np.empty(n)
+        _sample(uniforms, self._starts, self._goals, self._goal_rank, starts, goals, headings)
+        return starts, goals, headings
+
+
+@numba.njit(cache=True)
+def _sample(
+    uniforms: FloatArray,
+    start_cells: IntArray,
+    goal_cells: IntArray,
+    goal_rank: IntArray,
+    starts: IntArray,
+    goals: IntArray,
+    headings: FloatArray,
+) -> None:
+    for i in range(len(uniforms)):
+        # Start: uniform over the start cells.
+        row, col = start_cells[int(uniforms[i, 0] * len(start_cells))]
         # Goal: uniform over the goal cells that are not the start.
-        number = np.full((layout.n_rows, layout.n_cols), len(goals))
-        number[tuple(goals.T)] = np.arange(len(goals))
-        own = number[tuple(start.T)]
-        choices = len(goals) - (own < len(goals))
-        drawn = (uniforms[:, 1] * choices).astype(np.int64)
-        goal = goals[drawn + (drawn >= own)]
+        own = goal_rank[row, col]
+        choices = len(goal_cells) - (1 if own < len(goal_cells) else 0)
+        drawn = int(uniforms[i, 1] * choices)
+        starts[i, 0], starts[i, 1] = row, col
+        goals[i] = goal_cells[drawn + 1 if drawn >= own else drawn]
         # Heading: uniform over the circle.
-        return start, goal, (2.0 * uniforms[:, 2] - 1.0) * np.pi
+        headings[i] = (2.0 * uniforms[i, 2] - 1.0) * np.pi
 
 
 NAMED_TASKS = {

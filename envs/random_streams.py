@@ -1,0 +1,32 @@
+"""Streams of random numbers, one per environment of a batch."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gridnav.problem.types import FloatArray, IntArray
+
+
+class RandomStreams:
+    """One stream of uniform numbers per environment, drawn in blocks so that a batch costs no Python loop.
+
+    Environment i sees the numbers its generator would give one by one, whatever the others do.
+    """
+
+    BLOCK = 64
+
+    def __init__(self, generators: list[np.random.Generator]) -> None:
+        self.generators = generators
+        self._block = np.empty((len(generators), self.BLOCK))
+        self._next = np.full(len(generators), self.BLOCK)
+
+    def draw(self, ids: IntArray, n: int) -> FloatArray:
+        """The next ``n`` numbers in [0, 1) of the given streams, shape ``(len(ids), n)``."""
+        for i in ids[self._next[ids] + n > self.BLOCK]:
+            unused = self._block[i, self._next[i] :]
+            fresh = self.generators[i].random(self.BLOCK - unused.size)
+            self._block[i] = np.concatenate([unused, fresh])
+            self._next[i] = 0
+        columns = self._next[ids][:, None] + np.arange(n)
+        self._next[ids] += n
+        return self._block[ids[:, None], columns]
