@@ -366,8 +366,8 @@ def test_no_random_full_speed_drive_tunnels_tips_or_sinks(name: str, on_collisio
         assert wall_gaps(final["pose"][:, :2], layout).min() > BURGER.radius_m - 3e-3
         assert np.hypot(*(final["pose"] - before)[:, :2].T).max() < 1.5 * V * 0.2
         assert tilts_deg(env).max() < 5.0
-        # Reversing at full speed into a wall rocks the robot on its caster: a few millimetres at the axle.
-            assert np.abs(env._qpos[:, 2] - 0.033).max() < 6e-3
+        # Reversing into a wall at full speed rocks the robot on its caster: a few millimetres at the axle.
+        assert np.abs(env._qpos[:, 2] - 0.033).max() < 6e-3
         before = info["pose"]
     assert hits > 50
 
