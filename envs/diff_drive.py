@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import mujoco
@@ -11,6 +12,7 @@ from gymnasium.vector import AutoresetMode
 from mujoco.batch import Batch
 
 from gridnav.problem.geodesic import clearances
+from gridnav.problem.robot import BURGER, Robot
 from gridnav.problem.types import BoolArray, FloatArray, InputError, IntArray
 
 from . import gl
@@ -19,12 +21,13 @@ from .robot_world import RELEASE_M, SAME_WALL, RobotEnv, RobotVectorEnv
 
 TIMESTEP_S = 0.02
 """By measurement, see docs/speed.md: 10 ms is five times as accurate and takes nearly twice as long."""
-BUMPER_PERIOD_S = 0.05
-"""The bumper is looked at no less often than this: the Burger publishes its sensors at 20 Hz."""
+BUMPER_PERIOD_S = 0.1
+"""The bumper is answered to no less often than this: TurtleBot3's navigation steers at 10 Hz (T move_base)."""
 CONTACT_MARGIN_M = 0.003
 """A bumper this close to a wall after a contact still counts as pressed: soft contacts push the robot out a little."""
 INTO_WALL = 1e-3
 """Forward command times the cosine of the angle to a wall from which on a command drives into it."""
+LIDAR: dict[str, Any] = {"n_beams": 1, "lidar_range_m": 1.0, "lidar_offset_m": 0.0}
 CAMERAS = ("above", "chase", "onboard")
 
 
@@ -33,6 +36,7 @@ class DiffDriveVectorEnv(RobotVectorEnv):
 
     Args:
         num_envs: Robots in the batch.
+        robot: The Burger, whose lidar may have other numbers.
         timestep_s: Longest timestep of the physics, seconds; a whole number of timesteps makes a control period.
         n_threads: Threads of the physics, 0 for all cores. The trajectories do not depend on it.
         camera: The camera of ``rgb_array``: ``above``, ``chase`` or ``onboard``.
@@ -52,6 +56,7 @@ class DiffDriveVectorEnv(RobotVectorEnv):
         self,
         num_envs: int = 1,
         *,
+        robot: Robot = BURGER,
         timestep_s: float = TIMESTEP_S,
         n_threads: int = 0,
         camera: str = "above",
@@ -63,10 +68,12 @@ class DiffDriveVectorEnv(RobotVectorEnv):
             raise InputError(f"camera {camera!r} is none of {', '.join(CAMERAS)}")
         if not 0.0005 <= timestep_s <= TIMESTEP_S:
             raise InputError(f"timestep_s {timestep_s} is outside 0.0005 to {TIMESTEP_S} s")
+        if replace(robot, **LIDAR) != replace(BURGER, **LIDAR):
+            raise InputError(f"{robot} is no Burger: the compiled model is, so only the lidar's numbers may differ")
         self._timestep_s, self._n_threads = float(timestep_s), n_threads
         self._camera, self._picture_size = camera, (width, height)
         self._renderer: mujoco.Renderer | None = None
-        super().__init__(num_envs, **shared)
+        super().__init__(num_envs, robot=robot, **shared)
 
     def _use_layout(self) -> None:
         super()._use_layout()
@@ -208,8 +215,8 @@ class DiffDriveEnv(RobotEnv[DiffDriveVectorEnv]):
         return self.worlds.model
 
 
-# `clearances` is called from outside: a function that
-# compiles in another file's would not notice its changes, and so could not be cached on disk.
+# `clearances` is called beforehand: a compiled function that calls one of another file does not notice when that file
+# changes, and so could not be kept on disk.
 @numba.njit(cache=True)
 def _bump(
     has_driven: bool,
@@ -238,8 +245,9 @@ def _bump(
             x, y = qpos[i, 0], qpos[i, 1]
             travelled[i] += np.sqrt((x - position[i, 0]) ** 2 + (y - position[i, 1]) ** 2)
             position[i, 0], position[i, 1] = x, y
-            if gap[i] < radius and into:
-                begins[i] |= not stops or not _knows(contact, direction, i)
+            known = _knows(contact, direction, i)
+            if into and gap[i] < radius + (CONTACT_MARGIN_M if known else 0.0):
+                begins[i] |= not (stops and known)
                 contact[i] = direction[i]
                 contact_is_inner[i] = inner[i]
             if gap[i] > radius + RELEASE_M:

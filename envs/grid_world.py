@@ -94,14 +94,24 @@ class GridWorldVectorEnv(NavigationVectorEnv):
         return fixed, layout
 
     def _place(self, ids: IntArray) -> None:
-        self._position[ids] = self._numbers(self._start[ids])
         goals = self._numbers(self._goal[ids])
         rows = self._row_of_cell[goals]
         if rows.min() < 0:
             self._add_goals(np.unique(goals[rows < 0]))
-            rows = self._row_of_cell[goals]
-        self._goal_number[ids], self._goal_row[ids], self._goal_place[ids] = goals, rows, self._goal_rank[goals]
-        self._transition.next_distance[ids] = self._moves_to_goal[rows, self._position[ids]]
+        _place(
+            ids,
+            self._cell,
+            goals,
+            self.layout.n_cols,
+            self._row_of_cell,
+            self._goal_rank,
+            self._moves_to_goal,
+            self._position,
+            self._goal_number,
+            self._goal_row,
+            self._goal_place,
+            self._transition.next_distance,
+        )
 
     def _add_goals(self, goals: IntArray) -> None:
         """Work out the moves from all cells to further goals, given by their cells' numbers."""
@@ -117,7 +127,7 @@ class GridWorldVectorEnv(NavigationVectorEnv):
             raise InputError(
                 f"action {_short(actions)} must be a whole number per environment, 0 up, 1 down, 2 left or 3 right"
             )
-        if array.min() < 0 or array.max() > 3:
+        if (array >> 2).any():  # other bits than the two of a move
             wrong = array[(array < 0) | (array > 3)][0]
             raise InputError(f"action {wrong} is outside Discrete(4): 0 up, 1 down, 2 left, 3 right")
         return array
@@ -231,6 +241,28 @@ class GridWorldEnv(NavigationEnv[GridWorldVectorEnv]):
 
     def __init__(self, *, observation: ObservationMode = "cell_goal", slip: float = 0.0, **shared: Any) -> None:
         super().__init__(GridWorldVectorEnv(1, observation=observation, slip=slip, autoreset=False, **shared))
+
+
+@numba.njit(cache=True)
+def _place(
+    ids: IntArray,
+    cell: IntArray,
+    goals: IntArray,
+    n_cols: int,
+    row_of_cell: IntArray,
+    goal_rank: IntArray,
+    moves_to_goal: NDArray[np.uint16],
+    position: IntArray,
+    goal_number: IntArray,
+    goal_row: IntArray,
+    goal_place: IntArray,
+    next_distance: FloatArray,
+) -> None:
+    for k in range(len(ids)):
+        i, goal = ids[k], goals[k]
+        position[i] = cell[i, 0] * n_cols + cell[i, 1]
+        goal_number[i], goal_row[i], goal_place[i] = goal, row_of_cell[goal], goal_rank[goal]
+        next_distance[i] = moves_to_goal[goal_row[i], position[i]]
 
 
 @numba.njit(cache=True)

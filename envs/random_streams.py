@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 
 from gridnav.problem.types import FloatArray, IntArray
@@ -13,7 +14,7 @@ class RandomStreams:
     Environment i sees the numbers its generator would give one by one, whatever the others do.
     """
 
-    BLOCK = 64
+    BLOCK = 128
 
     def __init__(self, generators: list[np.random.Generator]) -> None:
         self.generators = generators
@@ -22,11 +23,27 @@ class RandomStreams:
 
     def draw(self, ids: IntArray, n: int) -> FloatArray:
         """The next ``n`` numbers in [0, 1) of the given streams, shape ``(len(ids), n)``."""
-        for i in ids[self._next[ids] + n > self.BLOCK]:
-            unused = self._block[i, self._next[i] :]
-            fresh = self.generators[i].random(self.BLOCK - unused.size)
-            self._block[i] = np.concatenate([unused, fresh])
-            self._next[i] = 0
-        columns = self._next[ids][:, None] + np.arange(n)
-        self._next[ids] += n
-        return self._block[ids[:, None], columns]
+        numbers = np.empty((len(ids), n))
+        if not _take(ids, self._block, self._next, numbers):
+            for i in ids[self._next[ids] + n > self.BLOCK]:
+                unused = self._block[i, self._next[i] :]
+                fresh = self.generators[i].random(self.BLOCK - unused.size)
+                self._block[i] = np.concatenate([unused, fresh])
+                self._next[i] = 0
+            _take(ids, self._block, self._next, numbers)
+        return numbers
+
+
+@numba.njit(cache=True)
+def _take(ids: IntArray, block: FloatArray, position: IntArray, numbers: FloatArray) -> bool:
+    """Take numbers off the blocks, unless one of them has too few left."""
+    n = numbers.shape[1]
+    for i in ids:
+        if position[i] + n > block.shape[1]:
+            return False
+    for k in range(len(ids)):
+        i = ids[k]
+        for j in range(n):
+            numbers[k, j] = block[i, position[i] + j]
+        position[i] += n
+    return True

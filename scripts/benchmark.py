@@ -53,7 +53,7 @@ import numpy as np
 from gymnasium.vector.utils import batch_space
 
 WORLDS = ("Unicycle", "DiffDrive", "GridWorld")
-BARE, SCAN, PEER = "bare physics", "lidar scan", "peer"
+BARE, SCAN, HANDOUT, PEER = "bare physics", "lidar scan", "GridWorld's arrays alone", "peer"
 SIZES, QUICK_SIZES = (1, 16, 64, 256, 1024, 4096), (1, 16, 64)
 SCAN_SIZES = (64, 256, 1024)
 FROZEN_LAKE = "FrozenLake-v1"
@@ -76,7 +76,7 @@ class Row:
 
     name: str
     world: str
-    """A world's name, ``BARE``, ``SCAN`` or ``PEER``."""
+    """A world's name, ``BARE``, ``SCAN``, ``HANDOUT`` or ``PEER``."""
     num_envs: int
     """Environment steps in one call."""
     run: Callable[[int], float]
@@ -160,6 +160,31 @@ class VectorWorld:
         seconds = timed(self.step, calls)
         self.poses.append(self._info["pose"])
         return seconds
+
+
+class Handout:
+    """Only makes fresh copies of all that a step of a vector environment returned, an autoreset included.
+
+    Whatever a world does, a step cannot be cheaper than its arrays.
+    """
+
+    def __init__(self, worlds: VectorWorld) -> None:
+        worlds.envs.reset(seed=SEED)
+        while True:
+            *arrays, info = worlds.envs.step(worlds.envs.action_space.sample())
+            if "final_info" in info:
+                break
+        self._arrays = [*arrays, *arrays_in(info)]
+
+    def run(self, calls: int) -> float:
+        """See ``Row.run``."""
+        return timed(lambda: [array.copy() for array in self._arrays], calls)
+
+
+def arrays_in(info: dict[str, Any]) -> list[Any]:
+    """The arrays of an info and of the infos in it."""
+    nested = [arrays_in(value) if isinstance(value, dict) else [value] for value in info.values()]
+    return list(itertools.chain.from_iterable(nested))
 
 
 class SingleWorld:
@@ -288,6 +313,8 @@ def rows_of_size(num_envs: int, stack: ExitStack) -> list[Row]:
         worlds = VectorWorld(world, num_envs)
         stack.callback(worlds.envs.close)
         rows.append(Row(f"{world} N={num_envs}", world, num_envs, worlds.run))
+        if world == "GridWorld":
+            rows.append(Row(f"{HANDOUT} N={num_envs}", HANDOUT, num_envs, Handout(worlds).run))
         if world == "DiffDrive":
             bare = BareBatch(worlds)
             rows.append(Row(f"{BARE} N={num_envs}", BARE, num_envs, bare.run, most_calls=BARE_CALLS))
@@ -557,6 +584,7 @@ def ratios(best: str, workers: int) -> list[Ratio]:
         Ratio("DiffDrive N=4096 over N=256", "DiffDrive N=4096", robots, 0.85),
         Ratio("Unicycle over DiffDrive, N=1024", "Unicycle N=1024", "DiffDrive N=1024", 10.0),
         Ratio("Unicycle N=1024 over the best DiffDrive", "Unicycle N=1024", best, 10.0),
+        Ratio("GridWorld N=4096 of handing out its arrays", "GridWorld N=4096", f"{HANDOUT} N=4096"),
         Ratio(f"GridWorld N=4096 over {FROZEN_LAKE}", "GridWorld N=4096", FROZEN_LAKE, 400.0),
         *(
             Ratio(f"lidar scan, share of bare physics, N={n}", f"{BARE} N={n}", f"{SCAN} N={n}", 0.1, False)

@@ -2,9 +2,11 @@
 
 python scripts/model_settings.py [--drives 40] [--rounds 7] [--json FILE]
 
-Every row drives the same commands from the same poses: each wheel command uniform over the motor's range, held for
-0.4 s, ten seconds in all. The reference is the default model at a timestep of 0.5 ms. Throughput is that of bare
-physics on one thread, the rows taken in turns in every round.
+Every row drives the same commands from the same poses: each wheel's speed drawn anew every 0.4 s from U(-0.2, 1) of the
+motor's maximum, ten seconds in all, in `open` and in `classic` with whatever walls come in the way. An error is how far
+a robot ends from where the same model ends at a timestep of 0.5 ms; that of the planar robot, which is another model,
+is measured against the default model's. The speed is that of bare physics on one thread, relative to the default model
+in the same round, the rows taken in turns.
 """
 
 import argparse
@@ -12,6 +14,7 @@ import json
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -57,36 +60,79 @@ def no_looks(spec: mujoco.MjSpec) -> None:
             spec.delete(geom)
 
 
-MILLISECOND = 0.001
-INTEGRATORS = {
-    "discrete": mujoco.mjtIntegrator.mjINT_DISCRETE,
-    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
-    "Euler": mujoco.mjtIntegrator.mjINT_EULER,
-}
+def planar(spec: mujoco.MjSpec) -> None:
+    """A robot on three joints, x, y and yaw, pulled along by servos where its wheels would stand."""
+    base = spec.body("base")
+    for joint in list(spec.joints):
+        spec.delete(joint)
+    for actuator in list(spec.actuators):
+        spec.delete(actuator)
+    for name in ("wheel_left", "wheel_right", "caster"):
+        spec.geom(name).contype = spec.geom(name).conaffinity = 0
+    base.pos = [0.0, 0.0, BURGER.wheel_radius_m]
+    slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+    base.add_joint(name="x", type=slide, axis=[1, 0, 0])
+    base.add_joint(name="y", type=slide, axis=[0, 1, 0])
+    base.add_joint(name="yaw", type=hinge, axis=[0, 0, 1])
+    half = BURGER.wheel_separation_m / 2
+    # Along each wheel, and against slipping sideways; forces up to what rubber holds of half the robot's weight, 4 N.
+    for name, y, gear in (("left", half, [1, 0, 0]), ("right", -half, [1, 0, 0]), ("sideways", 0.0, [0, 1, 0])):
+        base.add_site(name=name, pos=[0.0, y, 0.0])
+        servo = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_SITE, gear=[*gear, 0, 0, 0])
+        servo.set_to_velocity(kv=100.0)
+        servo.forcelimited, servo.forcerange = True, [-4.0, 4.0]
+
+
+def both(*edits: Edit) -> Edit:
+    """One edit after the other."""
+
+    def edit(spec: mujoco.MjSpec) -> None:
+        for one in edits:
+            one(spec)
+
+    return edit
+
+
+DISCRETE = mujoco.mjtIntegrator.mjINT_DISCRETE
+IMPLICITFAST = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+EULER = mujoco.mjtIntegrator.mjINT_EULER
 ROWS: dict[str, Edit] = {
-    f"{name}, {step} ms": settings(integrator=integrator, timestep=step * MILLISECOND)
-    for name, integrator in INTEGRATORS.items()
-    for step in (2, 5, 10, 20)
+    "**default: discrete, 20 ms**": lambda spec: None,
+    "discrete, 2 ms": settings(timestep=0.002),
+    "discrete, 5 ms": settings(timestep=0.005),
+    "discrete, 10 ms": settings(timestep=0.01),
+    "discrete, 40 ms": settings(timestep=0.04),
+    "implicitfast, 2 ms": settings(integrator=IMPLICITFAST, timestep=0.002),
+    "implicitfast, 5 ms": settings(integrator=IMPLICITFAST, timestep=0.005),
+    "implicitfast, 10 ms": settings(integrator=IMPLICITFAST, timestep=0.01),
+    "implicitfast, 20 ms": settings(integrator=IMPLICITFAST),
+    "Euler, 2 ms": settings(integrator=EULER, timestep=0.002),
+    "Euler, 5 ms": settings(integrator=EULER, timestep=0.005),
+    "Euler, 10 ms": settings(integrator=EULER, timestep=0.01),
+    "default, midphase and islands on": flags_on,
+    "default, CG solver": settings(solver=mujoco.mjtSolver.mjSOL_CG),
+    "default, elliptic friction cone": settings(cone=mujoco.mjtCone.mjCONE_ELLIPTIC),
+    "default, sparse Jacobian": settings(jacobian=mujoco.mjtJacobian.mjJAC_SPARSE),
+    "default, two solver iterations": settings(iterations=2),
+    "default, cylinder wheels": cylinder_wheels,
+    "default, without the geoms that are only seen": no_looks,
+    "planar joints, implicitfast, 10 ms": both(planar, settings(integrator=IMPLICITFAST, timestep=0.01)),
+    "planar joints, implicitfast, 20 ms": both(planar, settings(integrator=IMPLICITFAST)),
 }
-ROWS["discrete, 40 ms"] = settings(timestep=0.04)
-AT_DEFAULT: dict[str, Edit] = {
-    "midphase and islands on": flags_on,
-    "CG solver": settings(solver=mujoco.mjtSolver.mjSOL_CG),
-    "elliptic friction cone": settings(cone=mujoco.mjtCone.mjCONE_ELLIPTIC),
-    "sparse Jacobian": settings(jacobian=mujoco.mjtJacobian.mjJAC_SPARSE),
-    "two solver iterations": settings(iterations=2),
-    "cylinder wheels": cylinder_wheels,
-    "without the geoms that are only seen": no_looks,
-}
-ROWS |= {f"default with {name}": edit for name, edit in AT_DEFAULT.items()}
 
 
-def compiled(edit: Edit | None, layout: Layout) -> mujoco.MjModel:
-    """The default model with an edit."""
+def compiled(edit: Edit, layout: Layout, timestep_s: float | None = None) -> mujoco.MjModel:
+    """The default model with an edit, and with another timestep if one is given."""
     spec = build_spec(layout)
-    if edit is not None:
-        edit(spec)
+    edit(spec)
+    if timestep_s is not None:
+        spec.option.timestep = timestep_s
     return spec.compile()
+
+
+def is_planar(model: mujoco.MjModel) -> bool:
+    """Whether the robot stands on three joints."""
+    return bool(model.nq == 3)
 
 
 class Drives:
@@ -105,93 +151,133 @@ class Drives:
         """Robots at the starts."""
         batch = Batch(model, self.n, nthread=n_threads)
         batch.qpos[:, :2] = self.starts
-        batch.qpos[:, 3], batch.qpos[:, 6] = np.cos(self.headings / 2), np.sin(self.headings / 2)
+        if is_planar(model):
+            batch.qpos[:, 2] = self.headings
+        else:
+            batch.qpos[:, 3], batch.qpos[:, 6] = np.cos(self.headings / 2), np.sin(self.headings / 2)
         return batch
+
+    def drive(self, batch: Batch, model: mujoco.MjModel) -> None:
+        """Carry out all commands."""
+        for wheels in self.commands:
+            batch.ctrl[:] = controls(model, wheels)
+            batch.step(nstep=round(COMMAND_S / model.opt.timestep))
 
     def positions(self, model: mujoco.MjModel) -> FloatArray:
         """Where the robots are after the drive, metres, shape ``(n, 2)``; NaN where the physics diverged."""
         batch = self.batch(model)
-        for command in self.commands:
-            batch.ctrl[:] = command
-            batch.step(nstep=round(COMMAND_S / model.opt.timestep))
+        self.drive(batch, model)
         diverged = (batch.warning[:, :, 1] > 0).any(axis=1)
         positions: FloatArray = np.where(diverged[:, None], np.nan, batch.qpos[:, :2])
         return positions
 
-    def seconds_per_command(self, model: mujoco.MjModel) -> float:
-        """Wall-clock time of one command of one robot on one thread."""
+    def seconds(self, model: mujoco.MjModel) -> float:
+        """Wall-clock time of the drive on one thread."""
         batch = self.batch(model, 1)
         began = time.perf_counter()
-        for command in self.commands:
-            batch.ctrl[:] = command
-            batch.step(nstep=round(COMMAND_S / model.opt.timestep))
-        return (time.perf_counter() - began) / self.n / len(self.commands)
+        self.drive(batch, model)
+        return time.perf_counter() - began
+
+
+def controls(model: mujoco.MjModel, wheels: FloatArray) -> FloatArray:
+    """Controls for wheel speeds in rad/s, shape ``(n, 2)``."""
+    if not is_planar(model):
+        return wheels
+    along = wheels * BURGER.wheel_radius_m
+    return np.column_stack([along, np.zeros(len(along))])
+
+
+def place(model: mujoco.MjModel, x: float, y: float, heading_rad: float) -> mujoco.MjData:
+    """One robot, at rest."""
+    data = mujoco.MjData(model)
+    data.qpos[:2] = x, y
+    if is_planar(model):
+        data.qpos[2] = heading_rad
+    else:
+        data.qpos[3:7] = np.cos(heading_rad / 2), 0.0, 0.0, np.sin(heading_rad / 2)
+    return data
 
 
 def turning(model: mujoco.MjModel) -> float:
-    """Yaw of a robot that turns in place at half speed for four seconds, as a fraction of what its wheels command."""
-    data = mujoco.MjData(model)
-    data.qpos[:2] = 1.25, 4.5
-    data.ctrl[:] = np.array([-0.5, 0.5]) * BURGER.max_wheel_speed_rad_s
-    yaw = 0.0
+    """Yaw after four seconds of turning in place with half the wheels' full speed, as a share of what was commanded."""
+    data = place(model, 1.25, 4.5, 0.0)
+    data.ctrl[:] = controls(model, np.array([[-0.5, 0.5]]) * BURGER.max_wheel_speed_rad_s)[0]
+    turned = 0.0
     for _ in range(round(4.0 / model.opt.timestep)):
         mujoco.mj_step(model, data)
-        yaw += data.qvel[5] * model.opt.timestep
-    wheels = (data.qpos[8] - data.qpos[7]) * BURGER.wheel_radius_m / BURGER.wheel_separation_m
-    return float(yaw / wheels)
+        turned += data.qvel[2 if is_planar(model) else 5] * model.opt.timestep
+    return float(turned / (4.0 * 0.5 * BURGER.max_turn_rad_s))
 
 
 def sinking(model: mujoco.MjModel) -> float:
     """Deepest that the bumper enters a wall met head-on at full speed, metres."""
-    data = mujoco.MjData(model)
-    data.qpos[:2] = 0.5, 4.75
-    data.qpos[3:7] = 0.0, 0.0, 0.0, 1.0  # towards the left outer wall
-    data.ctrl[:] = BURGER.max_wheel_speed_rad_s
+    data = place(model, 0.5, 4.75, np.pi)  # towards the left outer wall
+    data.ctrl[:] = controls(model, np.full((1, 2), BURGER.max_wheel_speed_rad_s))[0]
     deepest = 0.0
     for _ in range(round(4.0 / model.opt.timestep)):
         mujoco.mj_step(model, data)
-        deepest = max(deepest, BURGER.radius_m - data.qpos[0])
+        deepest = max(deepest, BURGER.radius_m - float(data.qpos[0]))
     return deepest
 
 
 def main() -> None:
-    """Print the table."""
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--drives", type=int, default=40)
-    arguments.add_argument("--rounds", type=int, default=7)
-    arguments.add_argument("--json", type=Path)
-    given = arguments.parse_args()
+    """Print the table as Markdown."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--drives", type=int, default=40)
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    mujoco.set_mju_user_warning(lambda message: None)  # diverging rows are counted, not told
 
-    floor, maze = Layout.load("open"), Layout.load("classic")
-    reference = settings(timestep=REFERENCE_S)
-    drives = {"floor": Drives(Layout.random(n_rows=60, n_cols=60, density=0.0), given.drives)} if False else {}
-    drives = {"open": Drives(floor, given.drives), "classic": Drives(maze, given.drives)}
-    layouts = {"open": floor, "classic": maze}
-    truth = {name: drives[name].positions(compiled(reference, layouts[name])) for name in drives}
-
-    rows = {"default": None, **ROWS}
-    models = {name: compiled(edit, maze) for name, edit in rows.items()}
-    times: dict[str, list[float]] = {name: [] for name in rows}
+    layouts = {name: Layout.load(name) for name in ("open", "classic")}
+    drives = {name: Drives(layout, given.drives) for name, layout in layouts.items()}
+    models = {name: compiled(edit, layouts["classic"]) for name, edit in ROWS.items()}
+    seconds: dict[str, list[float]] = {name: [] for name in ROWS}
     for _ in range(given.rounds):
         for name, model in models.items():
-            times[name].append(drives["classic"].seconds_per_command(model))
+            seconds[name].append(drives["classic"].seconds(model))
 
     table = []
-    for name, edit in rows.items():
-        row: dict[str, object] = {"setting": name}
-        for where, drive in drives.items():
-            error = np.linalg.norm(drive.positions(compiled(edit, layouts[where])) - truth[where], axis=1)
-            row[f"error_m_{where}"] = [float(x) for x in np.nanquantile(error, (0.5, 0.9))]
-            row[f"diverged_{where}"] = int(np.isnan(error).sum())
-        row["yaw_of_wheels"] = turning(models[name])
-        row["wall_depth_mm"] = 1000 * sinking(models[name])
-        ratios = np.array(times["default"]) / np.array(times[name])
-        row["speed"] = [float(x) for x in (np.median(ratios), ratios.min(), ratios.max())]
-        row["us_per_mj_step"] = float(np.median(times[name]) * 1e6 / round(COMMAND_S / models[name].opt.timestep))
+    print("| setting | speed | us per `mj_step` | error `open`, m | error `classic`, m | yaw | wall depth, mm |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    for name, edit in ROWS.items():
+        model = models[name]
+        own = (lambda spec: None) if is_planar(model) else edit
+        errors = {}
+        for where, layout in layouts.items():
+            truth = drives[where].positions(compiled(own, layout, REFERENCE_S))
+            errors[where] = np.linalg.norm(drives[where].positions(compiled(edit, layout)) - truth, axis=1)
+        speeds = np.array(next(iter(seconds.values()))) / np.array(seconds[name])
+        n_steps = given.drives * round(DRIVE_S / model.opt.timestep)
+        row = {
+            "setting": name,
+            "speed": speeds.tolist(),
+            "us_per_step": float(np.median(seconds[name])) * 1e6 / n_steps,
+            **{f"error_m_{where}": error.tolist() for where, error in errors.items()},
+            "yaw": turning(model),
+            "wall_depth_m": sinking(model),
+        }
         table.append(row)
-        print(row, flush=True)
+        print(as_markdown(row), flush=True)
     if given.json:
         given.json.write_text(json.dumps(table, indent=1))
+
+
+def as_markdown(row: dict[str, Any]) -> str:
+    """One line of the table: medians, with the range of speeds and the ninth decile of errors."""
+    speeds = row["speed"]
+    cells = [row["setting"], f"{np.median(speeds):.2f} ({min(speeds):.2f} to {max(speeds):.2f})"]
+    cells.append(f"{row['us_per_step']:.1f}")
+    for where in ("open", "classic"):
+        error = np.array(row[f"error_m_{where}"])
+        diverged = np.isnan(error).sum()
+        median, ninth = np.nanquantile(error, (0.5, 0.9)) if diverged < error.size else (np.nan, np.nan)
+        cells.append(f"{diverged} of {error.size} diverged" if diverged else f"{median:.4f} (90 %: {ninth:.3f})")
+    if np.isfinite(row["yaw"]):
+        cells += [f"{row['yaw']:.3f}", f"{1000 * row['wall_depth_m']:.1f}"]
+    else:
+        cells += ["-", "-"]
+    return "| " + " | ".join(cells) + " |"
 
 
 if __name__ == "__main__":

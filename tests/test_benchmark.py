@@ -45,7 +45,9 @@ def test_a_quick_run_times_every_row(quick: tuple[dict[str, Any], Path, str]) ->
     report, _, printed = quick
     rows = {row["name"]: row for row in report["rows"]}
 
-    expected = {f"{world} N={n}" for world in (*WORLDS, "bare physics") for n in (1, 16, 64)}
+    expected = {
+        f"{world} N={n}" for world in (*WORLDS, "bare physics", "GridWorld's arrays alone") for n in (1, 16, 64)
+    }
     expected |= {f"{world} single" for world in WORLDS} | {"DiffDrive single, unwrapped", "mj_step", "lidar scan N=64"}
     expected |= {"SyncVectorEnv x8", "FrozenLake-v1"}
     assert set(rows) == expected

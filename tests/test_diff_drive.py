@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -224,6 +225,14 @@ def test_whole_timesteps_no_longer_than_asked_for_make_a_period(period: float, t
     assert env.model.opt.timestep <= timestep + 1e-12
     assert n_substeps == pytest.approx(round(n_substeps))
     np.testing.assert_allclose(env._batch.bind("time") - begin, 3 * period)
+
+
+def test_a_robot_that_is_no_burger_is_refused_and_another_lidar_is_not() -> None:
+    with pytest.raises(ValueError, match="no Burger"):
+        gym.make(ID, robot=replace(BURGER, wheel_radius_m=0.04))
+
+    env = gym.make(ID, robot=replace(BURGER, n_beams=36, lidar_range_m=8.0))
+    assert env.observation_space.shape == (35 - 24 + 36,)
 
 
 @pytest.mark.parametrize("timestep", [0.0, 0.021, float("nan"), -0.01])

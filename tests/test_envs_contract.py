@@ -344,9 +344,9 @@ def test_a_neighbours_reset_does_not_show_in_the_others(env_id: str) -> None:
 # ---- Scalar and vector, seeds and streams --------------------------------------------------------
 
 
-def test_a_batch_equals_single_environments_bit_for_bit_over_episodes(env_id: str) -> None:
-    seeds, steps = [11, 12, 13], 90
-    batch = gym.make_vec(env_id, num_envs=3, **SHORT)
+def assert_batch_equals_singles(env_id: str, seeds: list[int], steps: int, **options: Any) -> None:
+    """Every observation, reward, flag and info of a batch is that of single environments, to the last bit."""
+    batch = gym.make_vec(env_id, num_envs=len(seeds), **SHORT, **options)
     observations, info = batch.reset(seed=seeds)
     singles = [gym.make(env_id, **SHORT) for _ in seeds]
     for i, single in enumerate(singles):
@@ -354,8 +354,8 @@ def test_a_batch_equals_single_environments_bit_for_bit_over_episodes(env_id: st
         np.testing.assert_array_equal(observation, observations[i])
         assert_same_info(one_info, info, i)
 
-    ends = np.zeros(3, dtype=int)
-    for actions in draw_actions(env_id, steps, 3):
+    ends = np.zeros(len(seeds), dtype=int)
+    for actions in draw_actions(env_id, steps, len(seeds)):
         observations, rewards, terminated, truncated, info = batch.step(actions)
         for i, single in enumerate(singles):
             observation, reward, one_terminated, one_truncated, one_info = single.step(actions[i])
@@ -368,6 +368,19 @@ def test_a_batch_equals_single_environments_bit_for_bit_over_episodes(env_id: st
             np.testing.assert_array_equal(observation, observations[i])
             assert_same_info(one_info, info, i)
     assert ends.min() >= 3
+
+
+def test_a_batch_equals_single_environments_bit_for_bit_over_episodes(env_id: str) -> None:
+    assert_batch_equals_singles(env_id, [11, 12, 13], 90)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n_threads", [1, 2, 3])
+def test_a_batch_equals_single_environments_over_a_hundred_thousand_steps(env_id: str, n_threads: int) -> None:
+    threads = {"n_threads": n_threads} if env_id == "gridnav/DiffDrive-v0" else {}
+    if not threads and n_threads > 1:
+        pytest.skip("one thread is all that this world uses")
+    assert_batch_equals_singles(env_id, list(range(20)), 5_000, **threads)
 
 
 def test_an_environment_does_not_depend_on_what_the_others_do(env_id: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -103,6 +104,12 @@ def test_ranges_end_at_the_lidars_limit() -> None:
     # 4.8 m ahead reads 3.5 m.
     np.testing.assert_allclose(ranges, [[3.5, 2.5, 0.2, 2.5]], atol=1e-9)
     assert scan(np.array([[0.2, 2.5, 0.0]]), layout, replace(CENTRED, lidar_range_m=10.0))[0, 0] == pytest.approx(4.8)
+
+
+@pytest.mark.parametrize("n_beams", [0, 361, -1, 24.0, True])
+def test_a_number_of_beams_outside_1_to_360_is_refused(n_beams: Any) -> None:
+    with pytest.raises(ValueError, match="n_beams"):
+        replace(BURGER, n_beams=n_beams)
 
 
 @pytest.mark.parametrize("n_beams", [1, 2, 3, 24, 359, 360])

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 
-from gridnav.problem.types import FloatArray
+from gridnav.problem.types import FloatArray, InputError
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,13 @@ class Robot:
     """Longest range of the LDS-01, metres (M appendix LDS-01)."""
     n_beams: int = 24
     """Beams of a scan, evenly spaced over 360 degrees, the first ahead, counter-clockwise."""
+
+    def __post_init__(self) -> None:
+        for name in ("radius_m", "wheel_radius_m", "wheel_separation_m", "max_wheel_speed_rad_s", "lidar_range_m"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise InputError(f"robot {name} {getattr(self, name)} must be a positive number")
+        if isinstance(self.n_beams, bool) or not isinstance(self.n_beams, int) or not 1 <= self.n_beams <= 360:
+            raise InputError(f"robot n_beams {self.n_beams} must be a whole number from 1 to 360")
 
     @property
     def max_speed_m_s(self) -> float:
@@ -59,9 +67,17 @@ class Robot:
         Returns:
             Left and right wheel speed as fractions of the maximum, shape ``(n, 2)``, in [-1, 1].
         """
-        forward, turn = actions[:, 0], actions[:, 1]
-        wheels = np.stack([forward - turn, forward + turn], axis=1)
-        return np.minimum(np.maximum(wheels, -1.0), 1.0)
+        wheels = np.empty((len(actions), 2))
+        _wheel_fractions(actions, wheels)
+        return wheels
+
+
+@numba.njit(cache=True)
+def _wheel_fractions(actions: FloatArray, wheels: FloatArray) -> None:
+    for i in range(len(actions)):
+        forward, turn = actions[i, 0], actions[i, 1]
+        wheels[i, 0] = min(max(forward - turn, -1.0), 1.0)
+        wheels[i, 1] = min(max(forward + turn, -1.0), 1.0)
 
 
 BURGER = Robot()
