@@ -1,8 +1,9 @@
 """Measures the figures that the README states; run it with nothing else running.
 
-python scripts/measure.py q-learning          optimality and time of Q-learning, ten seeds
-python scripts/measure.py zero-shot           the Q-table driving DiffDrive, 200 episodes, five seeds
-python scripts/measure.py ppo [SEED ...]      PPO on DiffDrive from scratch and warm-started
+python scripts/measure.py q-learning                optimality and time of Q-learning, one goal and all goals, ten seeds
+python scripts/measure.py zero-shot                 the Q-table driving DiffDrive, 200 episodes, five seeds
+python scripts/measure.py ppo [SEED ...]            PPO on DiffDrive from scratch and warm-started
+python scripts/measure.py ppo-settings [SEED ...]   PPO's environments, rollout, batch, epochs and network compared
 """
 
 import sys
@@ -25,11 +26,27 @@ from gridnav.problem.metrics import summarise
 PROBLEM = Problem.load("classic", "default", "default")
 BUDGET = BUDGETS["default"]
 
+# What the default of PPOConfig was chosen among: environments, steps, batch, epochs, units of two hidden layers.
+PPO_SETTINGS = [
+    (256, 16, 512, 6, 64),
+    (256, 16, 512, 8, 64),
+    (128, 32, 512, 8, 64),
+    (128, 32, 1024, 8, 64),
+    (64, 64, 512, 8, 128),
+]
+
 
 def q_learning() -> None:
-    """Greedy moves against value iteration, from every reachable cell to every goal."""
-    layout, task = PROBLEM.layout, PROBLEM.task
-    best = Planner.solve(layout, task, PROBLEM.reward).action_values
+    """Greedy moves against value iteration, from every reachable cell to one goal and to every goal."""
+    only = np.zeros_like(PROBLEM.layout.goals)
+    only[9, 9] = True
+    _q_learning("one goal", replace(PROBLEM, layout=replace(PROBLEM.layout, goals=only)))
+    _q_learning("all goals", PROBLEM)
+
+
+def _q_learning(what: str, problem: Problem) -> None:
+    layout, task = problem.layout, problem.task
+    best = Planner.solve(layout, task, problem.reward).action_values
     # The oracle ties where two ways are equally short: any of the tied moves is optimal.
     optimal = (best > best.max(axis=1, keepdims=True) - 1e-9).reshape(layout.n_cells, -1, 4)
     goals = task.goal_cells(layout)
@@ -37,17 +54,18 @@ def q_learning() -> None:
     asked[goals[:, 0] * layout.n_cols + goals[:, 1], np.arange(len(goals))] = False
     seconds = []
     for seed in range(10):
-        table, took = _learn(seed)
+        table, took = _learn(seed, problem)
         seconds.append(took)
         chosen = table.action_values.reshape(optimal.shape).argmax(axis=2)
         right = np.take_along_axis(optimal, chosen[:, :, None], axis=2)[:, :, 0][asked]
-        worlds = PROBLEM.worlds("GridWorld", BUDGET.episodes)
+        worlds = problem.worlds("GridWorld", BUDGET.episodes)
         summary = summarise(evaluate(table.act, worlds))
         print(
-            f"seed {seed}: {right.sum()} of {right.size} moves optimal, success {summary.success_rate:.1%}, "
-            f"SPL {summary.spl:.3f}, {took:.2f} s"
+            f"{what}, seed {seed}: {right.sum()} of {right.size} moves optimal, success {summary.success_rate:.1%}, "
+            f"SPL {summary.spl:.3f}, {1000 * took:.0f} ms"
         )
-    print(f"time: median {np.median(seconds):.2f} s, range {min(seconds):.2f} to {max(seconds):.2f} s")
+    median, low, high = (1000 * f(seconds) for f in (np.median, min, max))
+    print(f"{what}: median {median:.0f} ms, range {low:.0f} to {high:.0f} ms")
 
 
 def zero_shot() -> None:
@@ -83,10 +101,38 @@ def ppo(seeds: list[int]) -> None:
             print(f"seed {seed} ppo-unicycle: {unicycle.steps:,} steps, {unicycle.seconds:.0f} s", flush=True)
 
 
-def _learn(seed: int) -> tuple[QLearning, float]:
-    config = QLearningConfig(seed=seed, gamma=PROBLEM.reward.gamma)
+def ppo_settings(seeds: list[int]) -> None:
+    """Each setting with each seed: speed, steps to a training success of 95 %, and what the greedy policy achieves."""
+    from gridnav.agents import PPOAgent, PPOConfig
+
+    judge = PROBLEM.worlds("DiffDrive", BUDGET.episodes)
+    for num_envs, n_steps, batch_size, n_epochs, units in PPO_SETTINGS:
+        for seed in seeds:
+            config = PPOConfig(seed, num_envs, n_steps, batch_size, n_epochs, hidden=(units, units))
+            worlds = PROBLEM.worlds("DiffDrive", num_envs)
+            agent = PPOAgent(worlds.single_observation_space, worlds.single_action_space, config)
+            curve: list[tuple[int, float]] = []
+            began = time.perf_counter()
+            agent.learn(
+                worlds,
+                steps=BUDGET.ppo_steps,
+                on_progress=lambda p, curve=curve: curve.append((p.steps, p.metrics["success_rate"])),
+            )
+            speed = curve[-1][0] / (time.perf_counter() - began)
+            reached = next((steps for steps, success in curve if success >= 0.95), None)
+            summary = summarise(evaluate(agent.act, judge))
+            print(
+                f"{num_envs} x {n_steps}, batch {batch_size}, {n_epochs} epochs, {units} x {units}, seed {seed}: "
+                f"{speed:,.0f} steps/s, 95 % after {reached} steps, greedy success {summary.success_rate:.1%}, "
+                f"collision rate {summary.collision_rate:.1%}",
+                flush=True,
+            )
+
+
+def _learn(seed: int, problem: Problem = PROBLEM) -> tuple[QLearning, float]:
+    config = QLearningConfig(seed=seed, gamma=problem.reward.gamma)
     began = time.perf_counter()
-    worlds = PROBLEM.worlds("GridWorld", config.num_envs, task=replace(PROBLEM.task, starts="any"))
+    worlds = problem.worlds("GridWorld", config.num_envs, task=replace(problem.task, starts="any"))
     table = QLearning(worlds.single_observation_space, worlds.single_action_space, config)
     table.learn(worlds, steps=BUDGET.q_learning_visits * table.action_values.size)
     return table, time.perf_counter() - began
@@ -108,5 +154,7 @@ if __name__ == "__main__":
         zero_shot()
     elif what == "ppo":
         ppo([int(number) for number in numbers] or [0, 1, 2])
+    elif what == "ppo-settings":
+        ppo_settings([int(number) for number in numbers] or [0, 1, 2])
     else:
         sys.exit(__doc__)

@@ -348,7 +348,7 @@ def test_sliding_along_a_wall_is_charged_in_every_step_of_it() -> None:
     assert np.mean(pressed) > 0.8
     assert all((info["reward_terms"]["collision"][0] < 0) == info["collision"][0] for info in infos)
     assert infos[-1]["pose"][0, 1] - infos[first]["pose"][0, 1] > 0.05
-    assert tilts_deg(env).max() < 5.0
+    assert tilts_deg(env).max() < 8.0
 
 
 @pytest.mark.parametrize("on_collision", ["stop", "slide"])
@@ -374,7 +374,7 @@ def test_no_random_full_speed_drive_tunnels_tips_or_sinks(name: str, on_collisio
         hits += int(final["collision"].sum())
         assert wall_gaps(final["pose"][:, :2], layout).min() > BURGER.radius_m - 3e-3
         assert np.hypot(*(final["pose"] - before)[:, :2].T).max() < 1.5 * V * 0.2
-        assert tilts_deg(env).max() < 5.0
+        assert tilts_deg(env).max() < 8.0
         # Reversing into a wall at full speed rocks the robot on its caster: a few millimetres at the axle.
         assert np.abs(env._qpos[:, 2] - 0.033).max() < 6e-3
         before = info["pose"]
