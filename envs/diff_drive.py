@@ -19,12 +19,12 @@ from . import gl
 from .mjcf import build_model
 from .robot_world import RELEASE_M, SAME_WALL, RobotEnv, RobotVectorEnv
 
-TIMESTEP_S = 0.02
-"""By measurement, see docs/speed.md: 10 ms is five times as accurate and takes nearly twice as long."""
+TIMESTEP_S = 0.025
+"""By measurement, see docs/speed.md: 10 ms is four times as accurate and takes more than twice as long."""
 BUMPER_PERIOD_S = 0.1
 """The bumper is answered to no less often than this: TurtleBot3's navigation steers at 10 Hz (T move_base)."""
 CONTACT_MARGIN_M = 0.003
-"""A bumper this close to a wall after a contact still counts as pressed: soft contacts push the robot out a little."""
+"""A bumper this close to a wall after a contact still touches it: soft contacts push the robot out a little."""
 INTO_WALL = 1e-3
 """Forward command times the cosine of the angle to a wall from which on a command drives into it."""
 LIDAR: dict[str, Any] = {"n_beams": 1, "lidar_range_m": 1.0, "lidar_offset_m": 0.0}
@@ -111,6 +111,8 @@ class DiffDriveVectorEnv(RobotVectorEnv):
             _bump(
                 n_substeps > 0,
                 stops,
+                SAME_WALL,
+                RELEASE_M,
                 self.robot.radius_m,
                 self.robot.max_wheel_speed_rad_s,
                 self._qpos,
@@ -196,8 +198,8 @@ class DiffDriveEnv(RobotEnv[DiffDriveVectorEnv]):
     ``gym.make``: 100 s).
 
     Args:
-        shared: ``layout``, ``task``, ``reward``, ``render_mode``, ``control_period_s``, ``camera``, ``width``,
-            ``height`` and ``max_episode_steps``, see ``DiffDriveVectorEnv``.
+        shared: ``layout``, ``task``, ``reward``, ``render_mode``, ``control_period_s``, ``timestep_s``, ``robot``,
+            ``camera``, ``width``, ``height`` and ``max_episode_steps``, see ``DiffDriveVectorEnv``.
     """
 
     metadata: dict[str, Any] = {
@@ -215,12 +217,14 @@ class DiffDriveEnv(RobotEnv[DiffDriveVectorEnv]):
         return self.worlds.model
 
 
-# `clearances` is called beforehand: a compiled function that calls one of another file does not notice when that file
-# changes, and so could not be kept on disk.
+# `clearances` is called beforehand and constants of other files are passed in: what is compiled and kept on disk does
+# not notice when another file changes.
 @numba.njit(cache=True)
 def _bump(
     has_driven: bool,
     stops: bool,
+    same_wall: float,
+    release: float,
     radius: float,
     max_wheel_speed: float,
     qpos: FloatArray,
@@ -245,23 +249,23 @@ def _bump(
             x, y = qpos[i, 0], qpos[i, 1]
             travelled[i] += np.sqrt((x - position[i, 0]) ** 2 + (y - position[i, 1]) ** 2)
             position[i, 0], position[i, 1] = x, y
-            known = _knows(contact, direction, i)
+            known = _along(contact, direction, i) > same_wall
             if into and gap[i] < radius + (CONTACT_MARGIN_M if known else 0.0):
                 begins[i] |= not (stops and known)
                 contact[i] = direction[i]
                 contact_is_inner[i] = inner[i]
-            if gap[i] > radius + RELEASE_M:
+            if gap[i] > radius + release:
                 contact[i] = 0.0
-        refuse = stops and into and gap[i] < radius + CONTACT_MARGIN_M and _knows(contact, direction, i)
+        refuse = stops and into and _along(contact, direction, i) > same_wall
         refused[i] |= refuse
         for side in range(2):
             ctrl[i, side] = (wheels[i, side] - (forward if refuse else 0.0)) * max_wheel_speed
 
 
 @numba.njit(cache=True)
-def _knows(contact: FloatArray, direction: FloatArray, i: int) -> bool:
-    """Whether the nearest wall is the one that the bumper already met."""
-    return contact[i, 0] * direction[i, 0] + contact[i, 1] * direction[i, 1] > SAME_WALL
+def _along(contact: FloatArray, direction: FloatArray, i: int) -> float:
+    """Cosine of the angle between the wall that the bumper met and the nearest one, 0 without a contact."""
+    return contact[i, 0] * direction[i, 0] + contact[i, 1] * direction[i, 1]
 
 
 @numba.njit(cache=True)

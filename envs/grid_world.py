@@ -143,6 +143,7 @@ class GridWorldVectorEnv(NavigationVectorEnv):
             actions,
             self._table.next_cell,
             self._table.hit_inner_wall,
+            MOVE_HEADINGS_RAD,
             self._cells,
             self._centres,
             self._moves_to_goal,
@@ -270,6 +271,7 @@ def _move(
     actions: IntArray,
     next_cell: IntArray,
     bumps_inner_wall: BoolArray,
+    headings: FloatArray,
     cells: IntArray,
     centres: FloatArray,
     moves_to_goal: NDArray[np.uint16],
@@ -294,7 +296,7 @@ def _move(
         hit_inner_wall[i] = bumps_inner_wall[before, action]
         travelled_m[i] = 0.0 if now == before else cell_size_m
         cell[i, 0], cell[i, 1] = cells[now, 0], cells[now, 1]
-        pose[i, 0], pose[i, 1], pose[i, 2] = centres[now, 0], centres[now, 1], MOVE_HEADINGS_RAD[action]
+        pose[i, 0], pose[i, 1], pose[i, 2] = centres[now, 0], centres[now, 1], headings[action]
         next_distance[i] = moves_to_goal[np.uint64(goal_row[i]), now]
         manhattan[i] = abs(cell[i, 0] - goal[i, 0]) + abs(cell[i, 1] - goal[i, 1])
         at_goal[i] = now == np.uint64(goal_number[i])

@@ -97,18 +97,18 @@ DISCRETE = mujoco.mjtIntegrator.mjINT_DISCRETE
 IMPLICITFAST = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
 EULER = mujoco.mjtIntegrator.mjINT_EULER
 ROWS: dict[str, Edit] = {
-    "**default: discrete, 20 ms**": lambda spec: None,
+    "**default: discrete, 25 ms**": lambda spec: None,
     "discrete, 2 ms": settings(timestep=0.002),
     "discrete, 5 ms": settings(timestep=0.005),
     "discrete, 10 ms": settings(timestep=0.01),
+    "discrete, 20 ms": settings(timestep=0.02),
     "discrete, 40 ms": settings(timestep=0.04),
     "implicitfast, 2 ms": settings(integrator=IMPLICITFAST, timestep=0.002),
     "implicitfast, 5 ms": settings(integrator=IMPLICITFAST, timestep=0.005),
     "implicitfast, 10 ms": settings(integrator=IMPLICITFAST, timestep=0.01),
-    "implicitfast, 20 ms": settings(integrator=IMPLICITFAST),
+    "implicitfast, 20 ms": settings(integrator=IMPLICITFAST, timestep=0.02),
     "Euler, 2 ms": settings(integrator=EULER, timestep=0.002),
     "Euler, 5 ms": settings(integrator=EULER, timestep=0.005),
-    "Euler, 10 ms": settings(integrator=EULER, timestep=0.01),
     "default, midphase and islands on": flags_on,
     "default, CG solver": settings(solver=mujoco.mjtSolver.mjSOL_CG),
     "default, pyramidal friction cone": settings(cone=mujoco.mjtCone.mjCONE_PYRAMIDAL),
@@ -118,7 +118,7 @@ ROWS: dict[str, Edit] = {
     "default, cylinder wheels": cylinder_wheels,
     "default, without the geoms that are only seen": no_looks,
     "planar joints, implicitfast, 10 ms": both(planar, settings(integrator=IMPLICITFAST, timestep=0.01)),
-    "planar joints, implicitfast, 20 ms": both(planar, settings(integrator=IMPLICITFAST)),
+    "planar joints, implicitfast, 20 ms": both(planar, settings(integrator=IMPLICITFAST, timestep=0.02)),
 }
 
 

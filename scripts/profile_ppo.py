@@ -1,6 +1,6 @@
 """Where PPO's wall-clock goes on DiffDrive; run it with nothing else running.
 
-python scripts/profile_ppo.py [--steps 131072] [--rounds 3] [--world DiffDrive] [--json FILE]
+python scripts/profile_ppo.py [--steps 131072] [--rounds 3] [--world DiffDrive] [--torch-threads 1]
 
 Every round trains a fresh agent with the default settings and times the calls below from outside; they nest as the
 table shows. "Network arithmetic" is what torch works out: the policy's forward passes, the losses' backward passes,
@@ -62,11 +62,12 @@ def timed(owner: Any, method: str, seconds: dict[str, float], name: str) -> Iter
         setattr(owner, method, plain)
 
 
-def profile(world: str, steps: int, seed: int) -> dict[str, float]:
+def profile(world: str, steps: int, seed: int, torch_threads: int) -> dict[str, float]:
     """Seconds of each part of one training, and of the whole."""
     config = PPOConfig(seed=seed)
     worlds = Problem.load("classic", "default", "default").worlds(world, config.num_envs)
     agent = PPOAgent(worlds.single_observation_space, worlds.single_action_space, config)
+    torch.set_num_threads(torch_threads)
     agent.learn(worlds, steps=config.num_envs * config.n_steps)  # compiles and warms up
     seconds: dict[str, float] = defaultdict(float)
     with ExitStack() as stack:
@@ -87,10 +88,11 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=131_072)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--world", choices=("DiffDrive", "Unicycle"), default="DiffDrive")
+    parser.add_argument("--torch-threads", type=int, default=1)
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
 
-    rounds = [profile(given.world, given.steps, seed) for seed in range(given.rounds)]
+    rounds = [profile(given.world, given.steps, seed, given.torch_threads) for seed in range(given.rounds)]
     rates = [given.steps / one["whole"] for one in rounds]
     print(
         f"{median(rates):,.0f} steps/s ({min(rates):,.0f} to {max(rates):,.0f}), {given.world}, {given.steps:,} steps"

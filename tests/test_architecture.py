@@ -193,3 +193,27 @@ def test_training_cannot_reach_the_held_out_worlds() -> None:
         ahead = set().union(*(OWN_IMPORTS[module] for module in ahead)) - reached
 
     assert "gridnav.experiment.reality" not in reached
+
+
+def imported_names(tree: ast.Module) -> set[str]:
+    """Names that a file takes from other files of gridnav."""
+    return {
+        alias.asname or alias.name
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and (node.level or (node.module or "").startswith("gridnav"))
+        for alias in node.names
+    }
+
+
+def test_what_is_compiled_and_kept_on_disk_uses_nothing_of_other_files() -> None:
+    """Numba notices changes of a function's own file alone: others' constants and functions would stay as they were."""
+    kept = 0
+    for module, tree in TREES.items():
+        foreign = imported_names(tree)
+        for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
+            if not any("cache=True" in ast.unparse(decorator) for decorator in function.decorator_list):
+                continue
+            kept += 1
+            body = {node.id for part in function.body for node in ast.walk(part) if isinstance(node, ast.Name)}
+            assert not body & foreign, f"{module}.{function.name} uses {sorted(body & foreign)}: pass them in"
+    assert kept > 10

@@ -80,7 +80,7 @@ def test_the_model_has_the_sourced_numbers_of_the_burger() -> None:
     assert model.geom("caster").pos[2] + 0.033 == pytest.approx(model.geom("caster").size[0])
     np.testing.assert_allclose(model.site("lidar").pos[:2], [BURGER.lidar_offset_m, 0.0])
     assert model.nq, model.nv == (9, 8)
-    assert (model.opt.timestep, model.opt.integrator) == (0.02, mujoco.mjtIntegrator.mjINT_DISCRETE)
+    assert (model.opt.timestep, model.opt.integrator) == (0.025, mujoco.mjtIntegrator.mjINT_DISCRETE)
     assert model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_AUTORESET
 
 
@@ -215,7 +215,7 @@ def test_one_command_is_held_for_the_whole_period() -> None:
 
 
 @pytest.mark.parametrize("period", [0.01, 0.05, 0.123, 0.2, 1.0])
-@pytest.mark.parametrize("timestep", [0.005, 0.02])
+@pytest.mark.parametrize("timestep", [0.005, 0.025])
 def test_whole_timesteps_no_longer_than_asked_for_make_a_period(period: float, timestep: float) -> None:
     env = start(control_period_s=period, timestep_s=timestep)
     begin = env._batch.bind("time").copy()
@@ -235,7 +235,7 @@ def test_a_robot_that_is_no_burger_is_refused_and_another_lidar_is_not() -> None
     assert env.observation_space.shape == (35 - 24 + 36,)
 
 
-@pytest.mark.parametrize("timestep", [0.0, 0.021, float("nan"), -0.01])
+@pytest.mark.parametrize("timestep", [0.0, 0.026, float("nan"), -0.01])
 def test_a_timestep_that_the_contacts_do_not_bear_is_refused(timestep: float) -> None:
     with pytest.raises(ValueError, match="timestep_s"):
         gym.make(ID, timestep_s=timestep)
@@ -372,11 +372,11 @@ def test_no_random_full_speed_drive_tunnels_tips_or_sinks(name: str, on_collisio
         final = info.get("final_info", info)
         assert "physics_error" not in final
         hits += int(final["collision"].sum())
-        assert wall_gaps(final["pose"][:, :2], layout).min() > BURGER.radius_m - 3e-3
+        assert wall_gaps(final["pose"][:, :2], layout).min() > BURGER.radius_m - 5e-3
         assert np.hypot(*(final["pose"] - before)[:, :2].T).max() < 1.5 * V * 0.2
         assert tilts_deg(env).max() < 8.0
         # Reversing into a wall at full speed rocks the robot on its caster: a few millimetres at the axle.
-        assert np.abs(env._qpos[:, 2] - 0.033).max() < 6e-3
+        assert np.abs(env._qpos[:, 2] - 0.033).max() < 8e-3
         before = info["pose"]
     assert hits > 50
 
@@ -393,7 +393,7 @@ def test_no_random_drive_tunnels_in_two_hundred_thousand_steps() -> None:
                 commands = rng.choice([-1.0, 0.0, 0.5, 1.0, 1.0], (256, 2)).astype(np.float32)
             info = env.step(commands)[4]
             final = info.get("final_info", info)
-            assert wall_gaps(final["pose"][:, :2], layout).min() > BURGER.radius_m - 3e-3
+            assert wall_gaps(final["pose"][:, :2], layout).min() > BURGER.radius_m - 5e-3
 
 
 # ---- Failing physics -----------------------------------------------------------------------------

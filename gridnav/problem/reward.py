@@ -101,7 +101,7 @@ class Reward:
         return source if isinstance(source, Reward) else cls.preset(source)
 
     def terms(self, step: Transition) -> dict[str, FloatArray]:
-        """Each term's share of the reward, by the names of ``TERM_NAMES``, shape ``(n,)`` each.
+        """Each term's share of the reward, by the names of ``TERM_NAMES``, fresh arrays of shape ``(n,)``.
 
         Progress is potential-based, so it leaves the optimal policy as it was (Ng, Harada and Russell 1999, Theorem 1);
         phi is 0 in terminal states, as the theorem asks.
@@ -143,7 +143,6 @@ def total(terms: dict[str, FloatArray]) -> FloatArray:
     return rewards
 
 
-# One pass over the batch: as array expressions the same terms take five times as long.
 @numba.njit(cache=True)
 def _terms(
     goal: float,
