@@ -82,9 +82,14 @@ class Agent(ABC):
 
 
 class EpisodeWindow:
-    """Success and return of the last training episodes."""
+    """Success and collisions of the last training episodes.
+
+    Success ends an episode and failure takes until the time limit, so the first episodes to end are the good ones: the
+    rates are not known before every environment has ended one.
+    """
 
     def __init__(self) -> None:
+        self._in_first: NDArray[np.bool_] | None = None  # environments that have not ended an episode yet
         self._successes: deque[float] = deque(maxlen=SUCCESS_WINDOW)
         self._collisions: deque[float] = deque(maxlen=SUCCESS_WINDOW)
         self.episodes = 0
@@ -94,22 +99,28 @@ class EpisodeWindow:
         if "final_info" not in info:
             return
         ended = info["_final_info"]
+        self._in_first = ~ended if self._in_first is None else self._in_first & ~ended
         self._successes.extend(info["final_info"]["is_success"][ended].tolist())
         self._collisions.extend((info["final_info"]["collisions"][ended] > 0).tolist())
         self.episodes += int(ended.sum())
 
     @property
     def is_full(self) -> bool:
-        """As many episodes were seen as the window holds."""
-        return len(self._successes) == SUCCESS_WINDOW
+        """As many episodes were seen as the window holds, and the rates are known."""
+        return len(self._successes) == SUCCESS_WINDOW and self._is_fair
 
     @property
     def metrics(self) -> dict[str, float]:
-        """``success_rate``, ``collision_rate`` and the ``episodes`` so far; rates are NaN before the first."""
-        if not self._successes:
-            return {"success_rate": float("nan"), "collision_rate": float("nan"), "episodes": 0.0}
+        """``success_rate``, ``collision_rate`` and the ``episodes`` so far; rates are NaN while they are not known."""
+        if not self._is_fair:
+            return {"success_rate": float("nan"), "collision_rate": float("nan"), "episodes": float(self.episodes)}
         return {
             "success_rate": float(np.mean(self._successes)),
             "collision_rate": float(np.mean(self._collisions)),
             "episodes": float(self.episodes),
         }
+
+    @property
+    def _is_fair(self) -> bool:
+        """Every environment has ended an episode."""
+        return self._in_first is not None and not self._in_first.any()

@@ -101,16 +101,14 @@ class DiffDriveVectorEnv(RobotVectorEnv):
         self._qpos[ids, 6] = np.sin(half)
 
     def _roll(self, actions: FloatArray) -> None:
-        wheels = self.robot.wheel_fractions(actions)
-        position = self._qpos[:, :2].copy()
-        stops = self.task.on_collision != "slide"
+        wheels, position = self.robot.wheel_fractions(actions), np.empty((self.num_envs, 2))
         for n_substeps in [0, *self._looks]:
             if n_substeps:
                 self._batch.step(nstep=n_substeps)
             gap, direction, inner = clearances(self._qpos, self.layout)
             _bump(
-                n_substeps > 0,
-                stops,
+                n_substeps == 0,
+                self.task.on_collision != "slide",
                 SAME_WALL,
                 RELEASE_M,
                 self.robot.radius_m,
@@ -128,7 +126,7 @@ class DiffDriveVectorEnv(RobotVectorEnv):
                 self._refused,
                 self._ctrl,
             )
-        _sense(
+        n_failed = _sense(
             self.robot.max_speed_m_s,
             self.robot.max_turn_rad_s,
             self._qpos,
@@ -138,7 +136,7 @@ class DiffDriveVectorEnv(RobotVectorEnv):
             self._speed,
             self._failed,
         )
-        if self._failed.any():
+        if n_failed:
             # Back to the last good pose, so that what is observed stays finite.
             self._rest(np.flatnonzero(self._failed))
 
@@ -197,6 +195,10 @@ class DiffDriveEnv(RobotEnv[DiffDriveVectorEnv]):
     it until the robot has turned or backed off. ``truncated`` after ``max_episode_steps`` (500 with
     ``gym.make``: 100 s).
 
+    ## Physics
+
+    MuJoCo steps of 25 ms (``timestep_s``), eight to a control period; the bumper is looked at after every 0.1 s.
+
     Args:
         shared: ``layout``, ``task``, ``reward``, ``render_mode``, ``control_period_s``, ``timestep_s``, ``robot``,
             ``camera``, ``width``, ``height`` and ``max_episode_steps``, see ``DiffDriveVectorEnv``.
@@ -221,7 +223,7 @@ class DiffDriveEnv(RobotEnv[DiffDriveVectorEnv]):
 # not notice when another file changes.
 @numba.njit(cache=True)
 def _bump(
-    has_driven: bool,
+    is_first: bool,
     stops: bool,
     same_wall: float,
     release: float,
@@ -240,15 +242,16 @@ def _bump(
     refused: BoolArray,
     ctrl: FloatArray,
 ) -> None:
-    """Note the contacts of the way since the last look, and refuse what drives on into a wall."""
+    """Note the contacts of the way since the last look, none at the first, and refuse what drives on into a wall."""
     for i in range(len(qpos)):
         forward = (wheels[i, 0] + wheels[i, 1]) / 2
         ahead_x, ahead_y = _ahead(qpos, i)
         into = forward * (direction[i, 0] * ahead_x + direction[i, 1] * ahead_y) > INTO_WALL
-        if has_driven:
-            x, y = qpos[i, 0], qpos[i, 1]
+        x, y = qpos[i, 0], qpos[i, 1]
+        if is_first:
+            travelled[i], begins[i], refused[i] = 0.0, False, False
+        else:
             travelled[i] += np.sqrt((x - position[i, 0]) ** 2 + (y - position[i, 1]) ** 2)
-            position[i, 0], position[i, 1] = x, y
             known = _along(contact, direction, i) > same_wall
             if into and gap[i] < radius + (CONTACT_MARGIN_M if known else 0.0):
                 begins[i] |= not (stops and known)
@@ -256,6 +259,7 @@ def _bump(
                 contact_is_inner[i] = inner[i]
             if gap[i] > radius + release:
                 contact[i] = 0.0
+        position[i, 0], position[i, 1] = x, y
         refuse = stops and into and _along(contact, direction, i) > same_wall
         refused[i] |= refuse
         for side in range(2):
@@ -278,21 +282,27 @@ def _sense(
     pose: FloatArray,
     speed: FloatArray,
     failed: BoolArray,
-) -> None:
+) -> int:
     """Poses and speeds of the robots whose physics holds; the others keep their last pose, at rest.
 
     The engine's warnings stay counted until the environment's next reset.
+
+    Returns:
+        How many robots' physics diverged.
     """
+    n_failed = 0
     for i in range(len(qpos)):
         failed[i] = not np.isfinite(qpos[i]).all() or not np.isfinite(qvel[i]).all() or (warning[i, :, 1] > 0).any()
         if failed[i]:
             speed[i] = 0.0
+            n_failed += 1
             continue
         ahead_x, ahead_y = _ahead(qpos, i)
         pose[i, 0], pose[i, 1], pose[i, 2] = qpos[i, 0], qpos[i, 1], np.arctan2(ahead_y, ahead_x)
         speed[i, 0] = (qvel[i, 0] * ahead_x + qvel[i, 1] * ahead_y) / max_speed
         # A free joint's angular velocity is in the body frame; its z axis is the robot's.
         speed[i, 1] = qvel[i, 5] / max_turn
+    return n_failed
 
 
 @numba.njit(cache=True)

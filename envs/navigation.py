@@ -189,13 +189,11 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         valid = self._valid(actions)
         self._transition.distance[:] = self._transition.next_distance
         self._drive(valid)
-        terminated, truncated = self._count()
+        terminated, truncated, n_ended = self._count()
         terms = self.reward.terms(self._transition)
         observations, info = self._observe(), self._info(terms)
-        if self._autoreset:
-            ended = np.flatnonzero(terminated | truncated)
-            if ended.size:
-                info = self._next_episodes(ended, observations, info)
+        if n_ended and self._autoreset:
+            info = self._next_episodes(np.flatnonzero(terminated | truncated), observations, info)
         return observations, total(terms), terminated, truncated, info
 
     @property
@@ -280,11 +278,11 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         cells = cells[(cells != starts[0]).any(axis=1)]
         return np.where((starts == goals).all(axis=1, keepdims=True), cells[0], goals)
 
-    def _count(self) -> tuple[BoolArray, BoolArray]:
-        """Count the step into the episodes; which of them it terminated and which it truncated."""
+    def _count(self) -> tuple[BoolArray, BoolArray, int]:
+        """Count the step into the episodes; which of them it terminated, which it truncated, and how many it ended."""
         step = self._transition
         terminated, truncated = np.empty(self.num_envs, dtype=bool), np.empty(self.num_envs, dtype=bool)
-        _count(
+        n_ended = _count(
             self.task.on_collision == "end",
             self.max_episode_steps or NO_LIMIT,
             self.layout.cell_size_m,
@@ -301,7 +299,7 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
             terminated,
             truncated,
         )
-        return terminated, truncated
+        return terminated, truncated, n_ended
 
     def _next_episodes(self, ended: IntArray, observations: AnyArray, info: dict[str, Any]) -> dict[str, Any]:
         """Autoreset in the same step: what ended goes to ``final_obs`` and ``final_info``.
@@ -434,7 +432,7 @@ def _count(
     time_up: BoolArray,
     terminated: BoolArray,
     truncated: BoolArray,
-) -> None:
+) -> int:
     # One loop per array, so that each compiles to vector instructions.
     n = len(steps)
     for i in range(n):
@@ -452,8 +450,11 @@ def _count(
         terminated[i] = terminal[i] | failed[i]
     for i in range(n):
         time_up[i] = steps[i] >= max_steps
+    n_ended = 0
     for i in range(n):
         truncated[i] = time_up[i]
+        n_ended += terminated[i] | truncated[i]
+    return n_ended
 
 
 @numba.njit(cache=True)

@@ -68,11 +68,10 @@ class RobotVectorEnv(NavigationVectorEnv):
         self._goal_number[ids] = self._geodesic.goal_numbers(self._goal[ids])
         self._contact[ids] = 0.0
         self._pressed_s[ids] = 0.0
-        self._transition.next_distance[ids] = self._distances(self._pose[ids], self._goal_number[ids])
+        metres = self._geodesic.distances(self._pose[ids], self._goal_number[ids])
+        self._transition.next_distance[ids] = metres / self.layout.cell_size_m
 
     def _drive(self, actions: AnyArray) -> None:
-        self._begins[:] = self._refused[:] = False
-        self._travelled_m[:] = 0.0
         self._roll(actions)
         self._last_action = actions
         step = self._transition
@@ -85,6 +84,7 @@ class RobotVectorEnv(NavigationVectorEnv):
             self._pose,
             self._goal_w,
             self._goal,
+            self._geodesic.distances(self._pose, self._goal_number),
             self._begins,
             self._refused,
             self._contact_is_inner,
@@ -95,20 +95,17 @@ class RobotVectorEnv(NavigationVectorEnv):
             step.hit,
             step.hit_inner_wall,
             step.at_goal,
+            step.next_distance,
             step.manhattan,
         )
-        step.next_distance[:] = self._distances(self._pose, self._goal_number)
 
     @abstractmethod
     def _roll(self, actions: FloatArray) -> None:
         """Drive for one control period.
 
-        Writes pose, speed, ``self._travelled_m``, ``self._begins``, ``self._refused``, ``self._contact``,
-        ``self._contact_is_inner`` and ``self._failed``; the last may hold what it was, the others are zero before.
+        Writes pose, speed, ``self._travelled_m``, ``self._begins``, ``self._refused`` and, where they change,
+        ``self._contact``, ``self._contact_is_inner`` and ``self._failed``.
         """
-
-    def _distances(self, poses: FloatArray, goal_numbers: IntArray) -> FloatArray:
-        return self._geodesic.distances(poses, goal_numbers) / self.layout.cell_size_m
 
     def _valid(self, actions: AnyArray) -> AnyArray:
         array = as_array(actions)
@@ -143,6 +140,7 @@ def _judge(
     pose: FloatArray,
     goal_w: FloatArray,
     goal: IntArray,
+    to_goal_m: FloatArray,
     begins: BoolArray,
     refused: BoolArray,
     contact_is_inner: BoolArray,
@@ -153,6 +151,7 @@ def _judge(
     hit: BoolArray,
     hit_inner_wall: BoolArray,
     at_goal: BoolArray,
+    next_distance: FloatArray,
     manhattan: FloatArray,
 ) -> None:
     """What a period came to: collisions, one more for every cell-time of pressing, the cell, and arrival."""
@@ -169,5 +168,6 @@ def _judge(
         row = n_rows - 1 - int(np.floor(pose[i, 1] / cell_size_m))
         col = int(np.floor(pose[i, 0] / cell_size_m))
         cell[i, 0], cell[i, 1] = min(max(row, 0), n_rows - 1), min(max(col, 0), n_cols - 1)
+        next_distance[i] = to_goal_m[i] / cell_size_m
         manhattan[i] = abs(cell[i, 0] - goal[i, 0]) + abs(cell[i, 1] - goal[i, 1])
         at_goal[i] = np.hypot(pose[i, 0] - goal_w[i, 0], pose[i, 1] - goal_w[i, 1]) <= goal_radius_m

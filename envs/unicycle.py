@@ -132,6 +132,7 @@ def _roll(
     n_substeps = int(np.ceil(period / SUBSTEP_S - 1e-9))
     for i in range(len(poses)):
         x, y, heading = poses[i]
+        travelled[i], begins[i], refused[i] = 0.0, False, False
         forward, turning = (wheels[i, 0] + wheels[i, 1]) / 2, (wheels[i, 1] - wheels[i, 0]) / 2
         speed, turn = forward * max_speed, turning * max_turn
         # Far from walls one arc does; near them, short ones that look for contact.

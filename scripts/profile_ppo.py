@@ -94,9 +94,7 @@ def main() -> None:
 
     rounds = [profile(given.world, given.steps, seed, given.torch_threads) for seed in range(given.rounds)]
     rates = [given.steps / one["whole"] for one in rounds]
-    print(
-        f"{median(rates):,.0f} steps/s ({min(rates):,.0f} to {max(rates):,.0f}), {given.world}, {given.steps:,} steps"
-    )
+    print(f"{median(rates):,.0f} steps/s ({min(rates):,.0f} to {max(rates):,.0f}), {given.world}")
     for name in [*(name for name, _, _ in TIMED), "network arithmetic", "physics and network"]:
         shares = [one.get(name, 0.0) / one["whole"] for one in rounds]
         print(f"{name:20} {median(shares):6.1%}  ({min(shares):.1%} to {max(shares):.1%})")

@@ -17,6 +17,7 @@ from gymnasium.vector.utils import batch_space
 
 from gridnav import Layout, Reward, Task
 from gridnav.agents import Agent, Planner, Progress, QLearning, QLearningConfig
+from gridnav.agents.base import EpisodeWindow
 from gridnav.envs import GridWorldVectorEnv
 from gridnav.problem.geodesic import cell_distances
 from gridnav.problem.grid_mdp import GridMDP, MoveTable
@@ -445,3 +446,17 @@ def test_ppo_values_a_truncated_episode_beyond_its_end_and_a_terminated_one_not(
             values.append(float(agent.policy.predict_values(torch.zeros(1, 1))))
 
     assert values[1] < 5 * values[0] < 0.0
+
+
+def test_the_success_rate_is_not_known_before_every_environment_has_ended_an_episode() -> None:
+    """Successes end early and failures at the time limit: the first to end would tell of the good ones alone."""
+    window = EpisodeWindow()
+    ended = {"is_success": np.array([True, False]), "collisions": np.array([0, 2])}
+
+    window.add({"final_info": ended, "_final_info": np.array([True, False])})
+    assert np.isnan(window.metrics["success_rate"])
+    assert window.metrics["episodes"] == 1
+
+    window.add({})
+    window.add({"final_info": ended, "_final_info": np.array([False, True])})
+    assert window.metrics == {"success_rate": 0.5, "collision_rate": 0.5, "episodes": 2.0}

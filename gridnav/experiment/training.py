@@ -35,7 +35,7 @@ class Budget:
 
 
 BUDGETS: dict[str, Budget] = {
-    "quick": Budget(q_learning_visits=190, ppo_steps=120_000, episodes=50),
+    "quick": Budget(q_learning_visits=190, ppo_steps=160_000, episodes=50),
     "default": Budget(q_learning_visits=190, ppo_steps=800_000, episodes=200),
     "full": Budget(q_learning_visits=600, ppo_steps=2_000_000, episodes=1000),
 }
