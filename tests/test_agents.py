@@ -11,13 +11,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from gridnav.agents.base import EpisodeWindow
 from gymnasium.spaces import Box, Discrete
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from gridnav import Layout, Reward, Task
 from gridnav.agents import Agent, Planner, Progress, QLearning, QLearningConfig
-from gridnav.agents.base import EpisodeWindow
 from gridnav.envs import GridWorldVectorEnv
 from gridnav.problem.geodesic import cell_distances
 from gridnav.problem.grid_mdp import GridMDP, MoveTable
