@@ -17,14 +17,14 @@ from gridnav.problem.types import BoolArray, FloatArray, InputError, IntArray
 
 from . import gl
 from .mjcf import build_model
-from .robot_world import RELEASE_M, SAME_WALL, RobotEnv, RobotVectorEnv
+from .robot_world import SAME_WALL, RobotEnv, RobotVectorEnv
 
 TIMESTEP_S = 0.025
 """By measurement, see docs/speed.md: 10 ms is four times as accurate and takes more than twice as long."""
 BUMPER_PERIOD_S = 0.1
 """The bumper is answered to no less often than this: TurtleBot3's navigation steers at 10 Hz (T move_base)."""
 CONTACT_MARGIN_M = 0.003
-"""A bumper this close to a wall after a contact still touches it: soft contacts push the robot out a little."""
+"""A bumper this close to a wall that it met still touches it: soft contacts push a sliding robot out a little."""
 INTO_WALL = 1e-3
 """Forward command times the cosine of the angle to a wall from which on a command drives into it."""
 LIDAR: dict[str, Any] = {"n_beams": 1, "lidar_range_m": 1.0, "lidar_offset_m": 0.0}
@@ -110,7 +110,7 @@ class DiffDriveVectorEnv(RobotVectorEnv):
                 n_substeps == 0,
                 self.task.on_collision != "slide",
                 SAME_WALL,
-                RELEASE_M,
+                self.release_m,
                 self.robot.radius_m,
                 self.robot.max_wheel_speed_rad_s,
                 self._qpos,

@@ -130,7 +130,7 @@ class GridWorldVectorEnv(NavigationVectorEnv):
         if (array >> 2).any():  # other bits than the two of a move
             wrong = array[(array < 0) | (array > 3)][0]
             raise InputError(f"action {wrong} is outside Discrete(4): 0 up, 1 down, 2 left, 3 right")
-        return array
+        return array.astype(np.int64)
 
     def _drive(self, actions: AnyArray) -> None:
         if self.slip > 0.0:

@@ -19,7 +19,7 @@ from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from gridnav.problem.layout import Layout
-from gridnav.problem.reward import TERM_NAMES, Reward, Transition, total
+from gridnav.problem.reward import TERM_NAMES, Reward, Transition, TutorialReward, total
 from gridnav.problem.robot import BURGER, Robot
 from gridnav.problem.task import DRAWS_PER_EPISODE, EpisodeSampler, Task
 from gridnav.problem.types import AnyArray, BoolArray, Cell, FloatArray, InputError, IntArray
@@ -191,6 +191,8 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         self._drive(valid)
         terminated, truncated, n_ended = self._count()
         terms = self.reward.terms(self._transition)
+        if type(self.reward).terms not in OWN_TERMS:  # a user's reward may hand out what it was given
+            terms = {name: np.array(share) for name, share in terms.items()}
         observations, info = self._observe(), self._info(terms)
         if n_ended and self._autoreset:
             info = self._next_episodes(np.flatnonzero(terminated | truncated), observations, info)
@@ -257,14 +259,14 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
     ) -> tuple[IntArray, IntArray, FloatArray]:
         """What was drawn, with what the reset's options fix."""
         fixed = self._fixed
-        goals = np.broadcast_to(fixed.get("goal", goals), goals.shape)
+        goals = np.broadcast_to(fixed.get("goal", goals), goals.shape).copy()
         if "start" in fixed:
-            starts = np.broadcast_to(fixed["start"], starts.shape)
+            starts = np.broadcast_to(fixed["start"], starts.shape).copy()
         elif "goal" in fixed:
             starts = self._other_start(starts, goals)
         if "start" in fixed and "goal" not in fixed:
             goals = self._other_goal(starts, goals)
-        return starts, goals, np.broadcast_to(fixed.get("heading_rad", headings), headings.shape)
+        return starts, goals, np.broadcast_to(fixed.get("heading_rad", headings), headings.shape).astype(np.float64)
 
     def _other_start(self, starts: IntArray, goals: IntArray) -> IntArray:
         """The drawn starts, moved to the task's next start cell where the fixed goal took theirs."""
@@ -406,13 +408,15 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
 
 
 NO_LIMIT = np.iinfo(np.int64).max
+OWN_TERMS = {Reward.terms, TutorialReward.terms}
+"""Rewards whose terms are fresh arrays."""
 
 
 def _still(n: int) -> Transition:
     """A transition of ``n`` worlds in which nothing happens."""
-    numbers: Any = [np.zeros(n) for _ in range(5)]
+    lengths: Any = [np.zeros(n) for _ in range(5)]
     facts: Any = [np.zeros(n, dtype=bool) for _ in range(5)]
-    return Transition(*numbers, *facts)
+    return Transition(*lengths, *facts)
 
 
 @numba.njit(cache=True)

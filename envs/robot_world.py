@@ -17,9 +17,9 @@ from .navigation import NavigationVectorEnv, as_array
 from .single import NavigationEnv, VectorWorld
 
 RELEASE_M = 0.02
-"""A contact is over once the bumper is this far from the wall: until then it is counted and charged once.
+"""A contact is over once the bumper is this far from the wall; until then it counts as one, and pressing counts again.
 
-A robot that meets a wall at full speed bounces off by up to 11 mm.
+A robot that meets a wall at full speed bounces off by up to 11 mm. In narrow corridors it is less, see ``release_m``.
 """
 SAME_WALL = 0.7
 """Cosine of the angle up to which two directions of contact mean one wall: another wall is another collision."""
@@ -52,6 +52,11 @@ class RobotVectorEnv(NavigationVectorEnv):
     def _spaces(self) -> tuple[gym.Space[Any], gym.Space[Any]]:
         return self._features.space, Box(-1.0, 1.0, (2,), np.float32)
 
+    @property
+    def release_m(self) -> float:
+        """``RELEASE_M``, or half of what a robot in the middle of a corridor has on each side."""
+        return min(RELEASE_M, (self.layout.cell_size_m / 2 - self.robot.radius_m) / 2)
+
     def _use_layout(self) -> None:
         super()._use_layout()
         self._geodesic = Geodesic(self.layout, self.robot.radius_m)
@@ -73,7 +78,7 @@ class RobotVectorEnv(NavigationVectorEnv):
 
     def _drive(self, actions: AnyArray) -> None:
         self._roll(actions)
-        self._last_action = actions
+        self._last_action[:] = actions
         step = self._transition
         _judge(
             self.layout.walls.shape,
@@ -116,7 +121,7 @@ class RobotVectorEnv(NavigationVectorEnv):
         if not np.isfinite(array).all():
             raise InputError(f"action {array[~np.isfinite(array).all(axis=1)][0].tolist()} must be finite numbers")
         # Beyond the box a command means full speed: a robot's firmware clips it too.
-        return np.minimum(np.maximum(array.astype(np.float64), -1.0), 1.0)
+        return np.minimum(np.maximum(array.astype(np.float64, order="C"), -1.0), 1.0)
 
 
 class RobotEnv(NavigationEnv[VectorWorld]):

@@ -12,7 +12,7 @@ from gridnav.problem.geodesic import clearance
 from gridnav.problem.types import BoolArray, FloatArray
 
 from .painter import Painter
-from .robot_world import RELEASE_M, SAME_WALL, RobotEnv, RobotVectorEnv
+from .robot_world import SAME_WALL, RobotEnv, RobotVectorEnv
 
 SUBSTEP_S = 0.01
 """Where a wall is near, contact is looked for this often: a robot at full speed moves 2 mm in it."""
@@ -44,6 +44,7 @@ class UnicycleVectorEnv(RobotVectorEnv):
             self.task.on_collision == "slide",
             self.layout.walls,
             self.layout.cell_size_m,
+            self.release_m,
             self._contact,
             self._contact_is_inner,
             self._travelled_m,
@@ -121,6 +122,7 @@ def _roll(
     slides: bool,
     walls: BoolArray,
     cell: float,
+    release: float,
     contact: FloatArray,
     contact_is_inner: BoolArray,
     travelled: FloatArray,
@@ -137,7 +139,7 @@ def _roll(
         speed, turn = forward * max_speed, turning * max_turn
         # Far from walls one arc does; near them, short ones that look for contact.
         gap, _, _, _ = clearance(x, y, walls, cell)
-        n = 1 if gap - radius > abs(speed) * period + RELEASE_M else n_substeps
+        n = 1 if gap - radius > abs(speed) * period + release else n_substeps
         dt = period / n
         for _ in range(n):
             turned = turn * dt
@@ -157,7 +159,7 @@ def _roll(
                 if not slides or clearance(to_x, to_y, walls, cell)[0] < radius - 1e-6:  # a second wall
                     to_x, to_y = x, y
                 way = np.hypot(to_x - x, to_y - y)
-            elif gap > radius + RELEASE_M:
+            elif gap > radius + release:
                 contact[i, 0] = contact[i, 1] = 0.0
             travelled[i] += way
             x, y, heading = to_x, to_y, heading + turned

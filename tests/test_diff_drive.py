@@ -79,7 +79,7 @@ def test_the_model_has_the_sourced_numbers_of_the_burger() -> None:
     assert model.body("base").pos[2] == 0.033
     assert model.geom("caster").pos[2] + 0.033 == pytest.approx(model.geom("caster").size[0])
     np.testing.assert_allclose(model.site("lidar").pos[:2], [BURGER.lidar_offset_m, 0.0])
-    assert model.nq, model.nv == (9, 8)
+    assert (model.nq, model.nv, model.opt.cone) == (9, 8, mujoco.mjtCone.mjCONE_ELLIPTIC)
     assert (model.opt.timestep, model.opt.integrator) == (0.025, mujoco.mjtIntegrator.mjINT_DISCRETE)
     assert model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_AUTORESET
 

@@ -305,3 +305,20 @@ def test_inside_a_wall_there_is_no_clearance_and_beyond_a_cell_it_reads_one_cell
 
     far, _, _ = clearances(np.array([(2.5, 2.5)]), Layout.from_text(".........\n" * 9))
     assert far[0] == 0.5
+
+
+@pytest.mark.parametrize(
+    "layout", [Layout.load("classic"), Layout.random(density=0.3, seed=1)], ids=["classic", "random"]
+)
+def test_looking_only_at_anchors_in_sight_changes_no_distance(layout: Layout, monkeypatch: pytest.MonkeyPatch) -> None:
+    few = Geodesic(layout, 0.105)
+    monkeypatch.setattr("gridnav.problem.geodesic.MAX_SIGHT_TESTS", 0)
+    all_of_them = Geodesic(layout, 0.105)
+    assert len(few._in_sight) < layout.n_cells * len(all_of_them._in_sight)
+
+    cells = np.argwhere(layout.reachable)
+    rng = np.random.default_rng(0)
+    points = layout.to_metres(cells[rng.integers(len(cells), size=500)]) + rng.uniform(-0.14, 0.14, (500, 2))
+    goals = cells[rng.integers(len(cells), size=500)]
+    one, other = (g.distances(points, g.goal_numbers(goals)) for g in (few, all_of_them))
+    np.testing.assert_array_equal(one, other)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -271,3 +271,10 @@ def test_an_unknown_preset_is_refused_with_the_names_that_exist(name: Any) -> No
 
     assert str(caught.value).isprintable()
     assert len(str(caught.value)) < 250
+
+
+def test_whole_numbers_as_weights_are_as_good_as_others() -> None:
+    whole = Reward(goal=20, collision_cost=3, distance_cost=0, time_cost=1, progress=2, gamma=1)
+
+    assert pay(whole, at_goal=True, terminal=True) == pytest.approx(20 - 1 + 2 * 5)
+    assert pay(replace(SEED, goal=20), at_goal=True, terminal=True) == pytest.approx(20)

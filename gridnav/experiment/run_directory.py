@@ -91,7 +91,7 @@ class MetricsLog:
     def add(self, series: str, steps: int, metrics: Mapping[str, float]) -> None:
         """Write one row, for example ``add("ppo", 16384, {"success_rate": 0.5})``."""
         row = {"steps": steps, **metrics}
-        # JSON has no NaN: a rate before the first episode is left out.
+        # JSON has no NaN: a rate that is not known yet is left out.
         finite = {name: value for name, value in row.items() if value == value}
         self._rows.setdefault(series, []).append(finite)
         self._file.write(json.dumps({"series": series, **finite}) + "\n")

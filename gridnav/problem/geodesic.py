@@ -66,7 +66,7 @@ class Geodesic:
         self.layout = layout
         self.radius_m = radius_m
         self._anchors = _anchors(layout, radius_m)
-        self._in_sight, self._first = _in_sight(layout, self._anchors)
+        self._in_sight, self._spans = _in_sight(layout, self._anchors)
         self._graph = self._visible_lengths(self._anchors)
         self._goals = np.empty((0, 2))
         self._costs = np.empty((0, len(self._anchors)))
@@ -109,7 +109,7 @@ class Geodesic:
             self._goals,
             self._anchors,
             self._in_sight,
-            self._first,
+            self._spans,
             self._costs,
             self.layout.walls,
             self.layout.cell_size_m,
@@ -190,14 +190,16 @@ def _in_sight(layout: Layout, anchors: FloatArray) -> tuple[IntArray, IntArray]:
     """Anchors that may be seen from somewhere in each cell: a query need not look at the others.
 
     Returns:
-        Numbers of anchors, cell after cell, shape ``(n,)``, and where in them each cell's begin, ``(n_cells + 1,)``.
+        Numbers of anchors, shape ``(n,)``, and where in them those of each cell begin and end, ``(n_cells, 2)``.
     """
     rectangles = layout.wall_rectangles()
+    if layout.n_cells * len(anchors) * len(rectangles) > MAX_SIGHT_TESTS:
+        return np.arange(len(anchors)), np.tile([0, len(anchors)], (layout.n_cells, 1))
     hidden = np.zeros((layout.n_cells, len(anchors)), dtype=np.bool_)
-    if hidden.size * len(rectangles) <= MAX_SIGHT_TESTS:
-        _hide(anchors, rectangles, layout.n_rows, layout.n_cols, layout.cell_size_m, hidden)
+    _hide(anchors, rectangles, layout.n_rows, layout.n_cols, layout.cell_size_m, hidden)
     cells, numbers = np.nonzero(~hidden)
-    return numbers, np.searchsorted(cells, np.arange(layout.n_cells + 1))
+    ends = np.searchsorted(cells, np.arange(layout.n_cells + 1))
+    return numbers, np.stack([ends[:-1], ends[1:]], axis=1)
 
 
 @numba.njit(cache=True)
@@ -247,7 +249,7 @@ def _shortest(
     goals: FloatArray,
     anchors: FloatArray,
     in_sight: IntArray,
-    first: IntArray,
+    spans: IntArray,
     costs: FloatArray,
     walls: BoolArray,
     cell: float,
@@ -266,7 +268,7 @@ def _shortest(
         cost = costs[goal_numbers[i]]
         col = min(max(int(np.floor(x / cell)), 0), n_cols - 1)
         row = n_rows - 1 - min(max(int(np.floor(y / cell)), 0), n_rows - 1)
-        near = in_sight[first[row * n_cols + col] : first[row * n_cols + col + 1]]
+        near = in_sight[spans[row * n_cols + col, 0] : spans[row * n_cols + col, 1]]
         n = len(near)
         for k in range(n):
             # Not hypot: its care for huge numbers costs more than all the rest.

@@ -101,7 +101,7 @@ class Reward:
         return source if isinstance(source, Reward) else cls.preset(source)
 
     def terms(self, step: Transition) -> dict[str, FloatArray]:
-        """Each term's share of the reward, by the names of ``TERM_NAMES``, fresh arrays of shape ``(n,)``.
+        """Each term's share of the reward, by the names of ``TERM_NAMES``, shape ``(n,)`` each.
 
         Progress is potential-based, so it leaves the optimal policy as it was (Ng, Harada and Russell 1999, Theorem 1);
         phi is 0 in terminal states, as the theorem asks.
@@ -137,7 +137,7 @@ class Reward:
 def total(terms: dict[str, FloatArray]) -> FloatArray:
     """The reward: the sum of its terms, shape ``(n,)``."""
     first, *others = terms.values()
-    rewards = first.copy()
+    rewards = first.astype(np.float64)
     for share in others:
         rewards += share
     return rewards

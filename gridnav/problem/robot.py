@@ -37,6 +37,10 @@ class Robot:
         for name in ("radius_m", "wheel_radius_m", "wheel_separation_m", "max_wheel_speed_rad_s", "lidar_range_m"):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise InputError(f"robot {name} {getattr(self, name)} must be a positive number")
+        if not abs(self.lidar_offset_m) <= self.radius_m:
+            raise InputError(
+                f"robot lidar_offset_m {self.lidar_offset_m} must lie within the radius of {self.radius_m} m"
+            )
         if isinstance(self.n_beams, bool) or not isinstance(self.n_beams, int) or not 1 <= self.n_beams <= 360:
             raise InputError(f"robot n_beams {self.n_beams} must be a whole number from 1 to 360")
 
