@@ -113,7 +113,7 @@ class PPOAgent(Agent):
             policy_kwargs={
                 "net_arch": list(config.hidden),
                 "log_std_init": config.log_std_init,
-                # Adam in one call for all weights, a quarter of its time otherwise; stable-baselines3's own epsilon.
+                # Adam in one call for all weights; the epsilon is stable-baselines3's own.
                 "optimizer_kwargs": {"eps": 1e-5, "fused": True},
             },
             device="cpu",

@@ -8,7 +8,7 @@ from .gl import RenderingError
 from .gl import works as gl_works
 from .grid_moves import GridMoves, MoveDriver
 from .grid_world import GridWorldEnv, GridWorldVectorEnv
-from .lidar import scan
+from .lidar import Lidar, scan
 from .mjcf import build_spec
 from .navigation import NavigationVectorEnv
 from .observation import FeatureVector
@@ -23,6 +23,7 @@ __all__ = [
     "GridMoves",
     "GridWorldEnv",
     "GridWorldVectorEnv",
+    "Lidar",
     "MoveDriver",
     "NavigationEnv",
     "NavigationVectorEnv",

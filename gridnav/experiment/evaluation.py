@@ -11,7 +11,7 @@ from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 
 from gridnav.agents import Agent, OnProgress, Progress, TabularAgent
-from gridnav.envs import MoveDriver, NavigationVectorEnv, scan
+from gridnav.envs import Lidar, MoveDriver, NavigationVectorEnv
 from gridnav.problem.metrics import Episode, Trace
 from gridnav.problem.types import AnyArray
 
@@ -111,6 +111,7 @@ class _Course:
 
     def __init__(self, worlds: NavigationVectorEnv) -> None:
         self._worlds = worlds
+        self._lidar = Lidar(worlds.layout, worlds.robot)
         self._starts, self._goals = worlds._start.copy(), worlds._goal.copy()
         self._poses: list[AnyArray] = []
         self._scans: list[AnyArray] = []
@@ -121,7 +122,7 @@ class _Course:
 
     def add_state(self, info: dict[str, Any]) -> None:
         self._poses.append(info["pose"])
-        self._scans.append(scan(info["pose"], self._worlds.layout, self._worlds.robot))
+        self._scans.append(self._lidar.scan(info["pose"]))
 
     def add_step(self, actions: AnyArray, rewards: AnyArray, info: dict[str, Any]) -> None:
         # Where an episode ended, the info is the next one's first: what led there is in final_info.
