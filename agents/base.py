@@ -13,9 +13,11 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
-from safetensors.numpy import load_file, save_file
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save
 
-WEIGHTS_FILE, AGENT_FILE = "weights.safetensors", "agent.json"
+from gridnav.problem.types import NonFiniteError, State
+
 SUCCESS_WINDOW = 400
 """Training episodes over which the success rate is averaged."""
 
@@ -33,6 +35,8 @@ class Progress:
 
 
 OnProgress = Callable[[Progress], None]
+OnCut = Callable[[Callable[[], State]], None]
+"""Called wherever training may be cut in two, with what makes the state of training there. It may raise to end it."""
 
 
 class Agent(ABC):
@@ -40,45 +44,126 @@ class Agent(ABC):
 
     kind: ClassVar[str]
     """Name on the command line and in files."""
-    files: ClassVar[tuple[str, ...]] = (WEIGHTS_FILE, AGENT_FILE)
-    """What ``save`` writes."""
 
     @abstractmethod
     def act(self, observations: NDArray[Any]) -> NDArray[Any]:
         """Greedy actions for a batch of observations, shape ``(n, ...)`` both."""
 
     @abstractmethod
-    def learn(self, env: VectorEnv[Any, Any, Any], *, steps: int, on_progress: OnProgress | None = None) -> None:
-        """Learn from at most ``steps`` environment steps of an environment that resets itself in the same step."""
+    def values(self, observations: NDArray[Any]) -> NDArray[Any]:
+        """What the agent expects to earn from each observation on, discounted, shape ``(n,)``."""
 
     @abstractmethod
-    def state(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-        """Arrays and JSON values from which ``from_state`` makes an agent that acts equally."""
+    def learn(
+        self,
+        env: VectorEnv[Any, Any, Any],
+        *,
+        steps: int,
+        on_progress: OnProgress | None = None,
+        on_cut: OnCut | None = None,
+        resume: State | None = None,
+    ) -> None:
+        """Learn from at most ``steps`` environment steps of an environment that resets itself in the same step.
+
+        Args:
+            env: Where.
+            steps: In all, those before a cut included.
+            on_progress: Told of steps and metrics once in a while.
+            on_cut: Called between two steps (PPO: two rollouts).
+            resume: What ``on_cut`` was given. The agent and the environment must be as they were then; what follows
+                is what would have followed, bit for bit, on one torch thread.
+
+        Raises:
+            NonFiniteError: When a NaN or infinity came up, before it reached the weights.
+        """
+
+    @abstractmethod
+    def state(self) -> State:
+        """What ``from_state`` makes an agent from that acts equally."""
 
     @classmethod
     @abstractmethod
-    def from_state(cls, arrays: dict[str, NDArray[Any]], values: dict[str, Any]) -> Self:
-        """The agent that ``state`` described."""
+    def from_state(cls, state: State) -> Self:
+        """The agent that ``state`` described.
+
+        Raises:
+            ValueError: When it describes none.
+        """
 
     def save(self, directory: Path) -> None:
-        """Write ``weights.safetensors`` and ``agent.json`` into a directory that exists."""
+        """Write ``agent.safetensors`` and ``agent.json`` into a directory that exists."""
         arrays, values = self.state()
-        save_file({name: np.ascontiguousarray(array) for name, array in arrays.items()}, directory / WEIGHTS_FILE)
-        text = json.dumps({"kind": self.kind, **values}, indent=2)
-        (directory / AGENT_FILE).write_text(text, encoding="utf-8")
+        write_state(State(arrays, {"kind": self.kind, **values}), directory, "agent")
 
     @classmethod
     def load(cls, directory: Path) -> Self:
         """Read what ``save`` wrote; nothing in the files is run.
 
         Raises:
-            ValueError: When the files hold another kind of agent.
+            ValueError: When the files hold another kind of agent, or none.
         """
-        values = json.loads((directory / AGENT_FILE).read_text(encoding="utf-8"))
-        kind = values.pop("kind", None)
+        state = read_state(directory, "agent")
+        kind = state.values.pop("kind", None)
         if kind != cls.kind:
-            raise ValueError(f"{directory} holds an agent of kind {kind!r}, not {cls.kind!r}")
-        return cls.from_state(load_file(directory / WEIGHTS_FILE), values)
+            raise ValueError(f"{directory} holds an agent of kind {kind!r:.60}, not {cls.kind!r}")
+        try:
+            return cls.from_state(state)
+        except (KeyError, TypeError, RuntimeError) as error:  # RuntimeError: torch's word for weights that do not fit
+            raise ValueError(f"{directory} does not hold what an agent of kind {cls.kind!r} is made of") from error
+
+
+def write_state(state: State, directory: Path, name: str) -> None:
+    """Write ``name.safetensors`` and ``name.json`` into a directory that exists."""
+    # Not `save_file`: a full disk is an OSError here.
+    content = save({key: np.ascontiguousarray(array) for key, array in state.arrays.items()})
+    (directory / f"{name}.safetensors").write_bytes(content)
+    (directory / f"{name}.json").write_text(json.dumps(state.values, allow_nan=False), encoding="utf-8")
+
+
+def read_state(directory: Path, name: str) -> State:
+    """Read what ``write_state`` wrote.
+
+    Raises:
+        ValueError: When a file is not what it should be.
+    """
+    try:
+        arrays = load_file(directory / f"{name}.safetensors")
+    except SafetensorError as error:
+        raise ValueError(f"{directory / name}.safetensors is damaged: {error}") from None
+    values = json.loads((directory / f"{name}.json").read_text(encoding="utf-8"))
+    if not isinstance(values, dict):
+        raise ValueError(f"{directory / name}.json must hold one JSON object")
+    return State(arrays, values)
+
+
+def reached(next_observations: NDArray[Any], info: dict[str, Any]) -> NDArray[Any]:
+    """The state that each step led to: where an episode ended, its last state and not the next one's first."""
+    if "final_obs" not in info:
+        return next_observations
+    observations, ended = next_observations.copy(), info["_final_obs"]
+    observations[ended] = np.stack(info["final_obs"][ended])
+    return observations
+
+
+def check_finite(steps: int, **batches: NDArray[Any]) -> None:
+    """Stop training where an environment handed out a NaN or infinity.
+
+    Args:
+        steps: Environment steps taken so far.
+        batches: Arrays with a leading batch axis, by the name they have in the message.
+
+    Raises:
+        NonFiniteError: When one of them is not finite.
+    """
+    for name, batch in batches.items():
+        if batch.dtype.kind != "f" or np.isfinite(batch).all():
+            continue
+        i, *place = np.argwhere(~np.isfinite(batch))[0].tolist()
+        field = f"{name}[{place[0]}]" if place else name
+        raise NonFiniteError(
+            f"training stopped at step {steps}: {field} of environment {i} is {batch[(i, *place)]}; the weights were "
+            "not touched by it"
+        )
 
 
 class EpisodeWindow:
@@ -93,6 +178,7 @@ class EpisodeWindow:
         self._successes: deque[float] = deque(maxlen=SUCCESS_WINDOW)
         self._collisions: deque[float] = deque(maxlen=SUCCESS_WINDOW)
         self.episodes = 0
+        self.physics_errors = 0
 
     def add(self, info: dict[str, Any]) -> None:
         """Take note of the episodes that a vector step ended, from ``final_info``."""
@@ -103,6 +189,28 @@ class EpisodeWindow:
         self._successes.extend(info["final_info"]["is_success"][ended].tolist())
         self._collisions.extend((info["final_info"]["collisions"][ended] > 0).tolist())
         self.episodes += int(ended.sum())
+        if "physics_error" in info["final_info"]:
+            self.physics_errors += int((info["final_info"]["physics_error"] & ended).sum())
+
+    def state(self) -> dict[str, Any]:
+        """Everything the window holds, fit for JSON."""
+        return {
+            "in_first": None if self._in_first is None else self._in_first.tolist(),
+            "successes": list(self._successes),
+            "collisions": list(self._collisions),
+            "episodes": self.episodes,
+            "physics_errors": self.physics_errors,
+        }
+
+    @classmethod
+    def from_state(cls, values: dict[str, Any]) -> Self:
+        """The window that ``state`` described."""
+        window = cls()
+        window._in_first = None if values["in_first"] is None else np.array(values["in_first"], dtype=bool)
+        window._successes.extend(values["successes"])
+        window._collisions.extend(values["collisions"])
+        window.episodes, window.physics_errors = values["episodes"], values["physics_errors"]
+        return window
 
     @property
     def is_full(self) -> bool:
@@ -111,13 +219,14 @@ class EpisodeWindow:
 
     @property
     def metrics(self) -> dict[str, float]:
-        """``success_rate``, ``collision_rate`` and the ``episodes`` so far; rates are NaN while they are not known."""
-        if not self._is_fair:
-            return {"success_rate": float("nan"), "collision_rate": float("nan"), "episodes": float(self.episodes)}
-        return {
-            "success_rate": float(np.mean(self._successes)),
-            "collision_rate": float(np.mean(self._collisions)),
+        """``success_rate``, ``collision_rate``, and ``episodes`` and ``physics_errors`` so far.
+
+        The rates are NaN while they are not known.
+        """
+        rates = {"success_rate": self._successes, "collision_rate": self._collisions}
+        return {name: float(np.mean(ends)) if self._is_fair else float("nan") for name, ends in rates.items()} | {
             "episodes": float(self.episodes),
+            "physics_errors": float(self.physics_errors),
         }
 
     @property

@@ -11,8 +11,9 @@ from gridnav.problem.grid_mdp import GridMDP
 from gridnav.problem.layout import Layout
 from gridnav.problem.reward import Reward
 from gridnav.problem.task import Task
+from gridnav.problem.types import State
 
-from .base import OnProgress
+from .base import OnCut, OnProgress
 from .tabular import TabularAgent
 
 
@@ -38,5 +39,13 @@ class Planner(TabularAgent):
         tables = [GridMDP.of(layout, goal, reward, task, gamma=gamma, slip=slip).solve() for goal in goals]
         return cls(np.stack(tables, axis=1).reshape(-1, 4))
 
-    def learn(self, env: VectorEnv[Any, Any, Any], *, steps: int, on_progress: OnProgress | None = None) -> None:
+    def learn(
+        self,
+        env: VectorEnv[Any, Any, Any],
+        *,
+        steps: int,
+        on_progress: OnProgress | None = None,
+        on_cut: OnCut | None = None,
+        resume: State | None = None,
+    ) -> None:
         """Nothing to learn: the plan is optimal already."""

@@ -20,10 +20,15 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from .base import Agent, EpisodeWindow, OnProgress, Progress
+from gridnav.problem.types import State
+
+from .base import Agent, EpisodeWindow, OnCut, OnProgress, Progress, check_finite, reached
+from .hyper_parameters import check_numbers
+from .torch_state import guard_gradients, load_optimizer_arrays, optimizer_arrays
 
 
 @dataclass(frozen=True)
@@ -35,6 +40,8 @@ class PPOConfig:
 
     seed: int = 0
     """Of weights, exploration and batches."""
+    steps: int = 800_000
+    """Environment steps of a training of the usual length."""
     num_envs: int = 256
     """Environments stepped together."""
     n_steps: int = 16
@@ -58,10 +65,20 @@ class PPOConfig:
     acts greedily."""
     hidden: tuple[int, ...] = (64, 64)
     """Units of the hidden layers (tanh) of policy and value network."""
+    ignored: tuple[int, ...] = ()
+    """Numbers of the observation that the networks never see, such as a pose that they are not to learn by heart."""
     reward_scale: float = 1.0
     """Factor on the rewards the learner sees: it keeps the value network's gradient from crowding out the policy's."""
+    exploring_starts: bool = False
+    """Training episodes start anywhere, and not where the task says."""
     target_success: float | None = None
     """Training stops once this share of the last 400 episodes arrived; never before its steps are used up if none."""
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
+
+
+PPO_PRESETS: dict[str, PPOConfig] = {"default": PPOConfig()}
 
 
 class PPOAgent(Agent):
@@ -87,16 +104,34 @@ class PPOAgent(Agent):
             observation_space,
             action_space,
             lr_schedule=lambda _: config.learning_rate,
-            net_arch=list(config.hidden),
-            log_std_init=config.log_std_init,
+            **_policy_options(config),
         )
 
     def act(self, observations: NDArray[Any]) -> NDArray[Any]:
         """The policy's mean commands, clipped to the action space."""
         return self.policy.predict(observations, deterministic=True)[0]
 
-    def learn(self, env: VectorEnv[Any, Any, Any], *, steps: int, on_progress: OnProgress | None = None) -> None:
-        """Improve the policy, from the weights it has."""
+    def values(self, observations: NDArray[Any]) -> NDArray[Any]:
+        """What the value network expects, in the reward's own unit, shape ``(n,)``."""
+        with torch.no_grad():
+            values = self.policy.predict_values(torch.as_tensor(observations)).numpy().ravel()
+        return values / self.config.reward_scale
+
+    @property
+    def planned_steps(self) -> int:
+        """Environment steps of a training of the usual length."""
+        return self.config.steps
+
+    def learn(
+        self,
+        env: VectorEnv[Any, Any, Any],
+        *,
+        steps: int,
+        on_progress: OnProgress | None = None,
+        on_cut: OnCut | None = None,
+        resume: State | None = None,
+    ) -> None:
+        """Improve the policy, from the weights it has; see ``Agent.learn``."""
         config = self.config
         adapter = Sb3VecEnv(env, config.reward_scale)
         model = PPO(
@@ -110,42 +145,119 @@ class PPOAgent(Agent):
             gamma=config.gamma,
             gae_lambda=config.gae_lambda,
             ent_coef=config.ent_coef,
-            policy_kwargs={
-                "net_arch": list(config.hidden),
-                "log_std_init": config.log_std_init,
-                # Adam in one call for all weights; the epsilon is stable-baselines3's own.
-                "optimizer_kwargs": {"eps": 1e-5, "fused": True},
-            },
+            # Adam in one call for all weights; the epsilon is stable-baselines3's own.
+            policy_kwargs=_policy_options(config) | {"optimizer_kwargs": {"eps": 1e-5, "fused": True}},
             device="cpu",
         )
         model.policy.load_state_dict(self.policy.state_dict())
+        self.policy = model.policy  # what is learnt before an interrupt counts too
         model.set_logger(Logger(folder=None, output_formats=[]))
-        try:
-            model.learn(steps, callback=_Reporter(adapter, steps, config, on_progress))
-        finally:
-            # What was learnt before an interrupt counts too.
-            self.policy.load_state_dict(model.policy.state_dict())
+        guard_gradients(model.policy.optimizer, lambda: model.num_timesteps)
+        between = _BetweenRollouts(adapter, steps, config, on_progress, on_cut)
+        if resume is None:
+            model.learn(steps, callback=between)
+        else:
+            _go_on(model, adapter, resume)
+            model.learn(steps - model.num_timesteps, callback=between, reset_num_timesteps=False)
 
-    def state(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    def state(self) -> State:
         """Weights; spaces and hyper-parameters."""
-        arrays = {name: tensor.numpy() for name, tensor in self.policy.state_dict().items()}
+        arrays = {name: tensor.numpy().copy() for name, tensor in self.policy.state_dict().items()}
         spaces = {"observation_space": self._observation_space, "action_space": self._action_space}
-        return arrays, {
-            "config": asdict(self.config),
-            **{name: {"low": space.low.tolist(), "high": space.high.tolist()} for name, space in spaces.items()},
-        }
+        bounds = {name: {"low": space.low.tolist(), "high": space.high.tolist()} for name, space in spaces.items()}
+        return State(arrays, {"config": asdict(self.config), **bounds})
 
     @classmethod
-    def from_state(cls, arrays: dict[str, NDArray[Any]], values: dict[str, Any]) -> Self:
-        """An agent with these weights."""
+    def from_state(cls, state: State) -> Self:
+        """An agent with these weights.
+
+        Raises:
+            ValueError: When a weight is not finite.
+        """
+        arrays, values = state
         observation_space, action_space = (
             Box(np.array(values[name]["low"], np.float32), np.array(values[name]["high"], np.float32))
             for name in ("observation_space", "action_space")
         )
-        config = PPOConfig(**{**values["config"], "hidden": tuple(values["config"]["hidden"])})
+        tuples = {name: tuple(values["config"][name]) for name in ("hidden", "ignored")}
+        config = PPOConfig(**{**values["config"], **tuples})
         agent = cls(observation_space, action_space, config)
+        if not all(np.isfinite(array).all() for array in arrays.values()):
+            raise ValueError("the weights must be finite numbers")
         agent.policy.load_state_dict({name: torch.from_numpy(array.copy()) for name, array in arrays.items()})
         return agent
+
+
+def _policy_options(config: PPOConfig) -> dict[str, Any]:
+    return {
+        "net_arch": list(config.hidden),
+        "log_std_init": config.log_std_init,
+        "features_extractor_class": Inputs,
+        "features_extractor_kwargs": {"ignored": config.ignored},
+    }
+
+
+class Inputs(BaseFeaturesExtractor):
+    """What the networks make of an observation before their first layer.
+
+    Numbers that cannot be negative are lengths, and near things matter more than far ones: x becomes x / (x + NEAR),
+    so that a centimetre beside a wall counts ten times one in the open. Ignored numbers become 0.
+    """
+
+    NEAR = 1 / 7
+    """As a fraction of the lidar's range (3.5 m): half a metre."""
+
+    seen: torch.Tensor
+    is_length: torch.Tensor
+
+    def __init__(self, observation_space: Box, ignored: tuple[int, ...] = ()) -> None:
+        super().__init__(observation_space, features_dim=int(np.prod(observation_space.shape)))
+        seen = torch.ones(self.features_dim)
+        seen[list(ignored)] = 0.0
+        self.register_buffer("seen", seen)
+        self.register_buffer("is_length", torch.from_numpy(observation_space.low.ravel() == 0.0))
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """Inputs of the first layer, shape ``(n, n_numbers)``."""
+        near = observations / (observations.abs() + self.NEAR)
+        return torch.where(self.is_length, near, observations) * self.seen
+
+
+def _state_of(model: PPO, adapter: Sb3VecEnv) -> State:
+    """Everything that decides what comes next, beside the weights and the environment.
+
+    Stable-baselines3 draws actions from torch's global stream and batches from NumPy's.
+    """
+    _, keys, position, has_gauss, gauss = np.random.get_state(legacy=True)  # noqa: NPY002
+    assert isinstance(model._last_obs, np.ndarray)
+    assert model._last_episode_starts is not None
+    arrays = optimizer_arrays(model.policy.optimizer) | {
+        "last_observations": model._last_obs.copy(),
+        "last_episode_starts": model._last_episode_starts.copy(),
+        "torch_stream": torch.get_rng_state().numpy().copy(),
+        "numpy_stream": np.asarray(keys).copy(),
+    }
+    values = {
+        "num_timesteps": model.num_timesteps,
+        "n_updates": model._n_updates,
+        "numpy_stream": [int(position), int(has_gauss), float(gauss)],
+        "window": adapter.window.state(),
+        "log": {name: float(value) for name, value in model.logger.name_to_value.items() if name in _REPORTED},
+    }
+    return State(arrays, values)
+
+
+def _go_on(model: PPO, adapter: Sb3VecEnv, state: State) -> None:
+    """Bring a model that was made alike to where ``_state_of`` looked; the streams last, for making a model draws."""
+    arrays, values = state
+    load_optimizer_arrays(model.policy.optimizer, arrays)
+    model.num_timesteps, model._n_updates = values["num_timesteps"], values["n_updates"]
+    adapter.window, adapter.steps = EpisodeWindow.from_state(values["window"]), values["num_timesteps"]
+    model._last_obs, model._last_episode_starts = arrays["last_observations"], arrays["last_episode_starts"]
+    for name, value in values["log"].items():
+        model.logger.record(name, value)
+    torch.set_rng_state(torch.from_numpy(arrays["torch_stream"].copy()))
+    np.random.set_state(("MT19937", arrays["numpy_stream"], *values["numpy_stream"]))  # noqa: NPY002
 
 
 class Sb3VecEnv(VecEnv):
@@ -159,6 +271,7 @@ class Sb3VecEnv(VecEnv):
         self.env = env
         self._reward_scale = reward_scale
         self.window = EpisodeWindow()
+        self.steps = 0
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> NDArray[Any]:
@@ -175,6 +288,9 @@ class Sb3VecEnv(VecEnv):
         """Step; the observation that ended an episode goes to ``terminal_observation``."""
         observations, rewards, terminated, truncated, info = self.env.step(self._actions)
         self.window.add(info)
+        self.steps += self.num_envs
+        scaled = (self._reward_scale * rewards).astype(np.float32)
+        check_finite(self.steps, reward=scaled, observation=reached(observations, info), first_observation=observations)
         dones = terminated | truncated
         infos: list[dict[str, Any]] = [_NOTHING] * self.num_envs
         for i in np.flatnonzero(dones):
@@ -183,7 +299,7 @@ class Sb3VecEnv(VecEnv):
                 # A time limit is no end of the task: PPO bootstraps there.
                 "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
             }
-        return observations, (self._reward_scale * rewards).astype(np.float32), dones, infos
+        return observations, scaled, dones, infos
 
     def close(self) -> None:
         """Leave the environment open: who made it closes it."""
@@ -211,27 +327,43 @@ class Sb3VecEnv(VecEnv):
 _NOTHING: dict[str, Any] = {}
 
 
-class _Reporter(BaseCallback):
-    """Between rollouts: reports, narrows exploration, and stops at the success that is asked for."""
+_REPORTED = ("train/approx_kl", "train/explained_variance", "train/std", "train/value_loss")
+"""What stable-baselines3 logs of an update that goes into the metrics."""
 
-    def __init__(self, adapter: Sb3VecEnv, total_steps: int, config: PPOConfig, on_progress: OnProgress | None) -> None:
+
+class _BetweenRollouts(BaseCallback):
+    """Reports, narrows exploration, lets training be cut, and stops at the success that is asked for."""
+
+    def __init__(
+        self,
+        adapter: Sb3VecEnv,
+        total_steps: int,
+        config: PPOConfig,
+        on_progress: OnProgress | None,
+        on_cut: OnCut | None,
+    ) -> None:
         super().__init__()
-        self._window = adapter.window
-        self._total_steps, self._config, self._on_progress = total_steps, config, on_progress
+        self._adapter, self._total_steps, self._config = adapter, total_steps, config
+        self._on_progress, self._on_cut = on_progress, on_cut
+
+    def _on_training_start(self) -> None:
+        self._reported = self.model.num_timesteps  # nothing yet, or what was reported before the cut
 
     def _on_step(self) -> bool:
-        target = self._config.target_success
-        if target is None or not self._window.is_full:
-            return True
-        return self._window.metrics["success_rate"] < target
+        target, window = self._config.target_success, self._adapter.window
+        return target is None or not window.is_full or window.metrics["success_rate"] < target
 
     def _on_rollout_start(self) -> None:
         self._cap_exploration()
         self._report()
+        if self._on_cut is not None:
+            assert isinstance(self.model, PPO)
+            model = self.model
+            self._on_cut(lambda: _state_of(model, self._adapter))
 
     def _cap_exploration(self) -> None:
         first, last = self._config.log_std_init, self._config.log_std_final
-        share = min(1.0, max(0.0, 2.0 * self.num_timesteps / self._total_steps - 1.0))
+        share = min(1.0, max(0.0, 2.0 * self.model.num_timesteps / self._total_steps - 1.0))
         cap = first + (last - first) * share
         log_std = self.model.policy.log_std
         assert isinstance(log_std, torch.Tensor)
@@ -239,15 +371,12 @@ class _Reporter(BaseCallback):
             log_std.clamp_(max=cap)
 
     def _report(self) -> None:
-        if self._on_progress is None or self.num_timesteps == 0:
+        steps, values = self.model.num_timesteps, self.logger.name_to_value
+        if self._on_progress is None or steps == self._reported:
             return
-        values = self.logger.name_to_value
-        metrics = self._window.metrics | {
-            name.split("/")[1]: float(values[name])
-            for name in ("train/approx_kl", "train/explained_variance", "train/std", "train/value_loss")
-            if name in values
-        }
-        self._on_progress(Progress(self.num_timesteps, self._total_steps, metrics))
+        self._reported = steps
+        train = {name.split("/")[1]: float(values[name]) for name in _REPORTED if name in values}
+        self._on_progress(Progress(steps, self._total_steps, self._adapter.window.metrics | train))
 
     def _on_training_end(self) -> None:
         self._report()

@@ -7,7 +7,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from gridnav.problem.types import FloatArray
+from gridnav.problem.types import FloatArray, State
 
 from .base import Agent
 
@@ -26,13 +26,24 @@ class TabularAgent(Agent):
         """Greedy actions, shape ``(n,)``; ties go to the lower number."""
         return self.action_values[observations].argmax(axis=1)
 
-    def state(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    def values(self, observations: NDArray[Any]) -> NDArray[Any]:
+        """The values of the best actions, shape ``(n,)``."""
+        return self.action_values[observations].max(axis=1)
+
+    def state(self) -> State:
         """The table; nothing else."""
-        return {"action_values": self.action_values}, {}
+        return State({"action_values": self.action_values}, {})
 
     @classmethod
-    def from_state(cls, arrays: dict[str, NDArray[Any]], values: dict[str, Any]) -> Self:
-        """An agent with this table."""
+    def from_state(cls, state: State) -> Self:
+        """An agent with this table.
+
+        Raises:
+            ValueError: When it is no table of numbers.
+        """
+        table = np.asarray(state.arrays["action_values"], dtype=np.float64)
+        if table.ndim != 2 or not np.isfinite(table).all():
+            raise ValueError(f"action_values of shape {table.shape} must be a table of finite numbers")
         agent = cls.__new__(cls)
-        TabularAgent.__init__(agent, np.asarray(arrays["action_values"], dtype=np.float64))
+        TabularAgent.__init__(agent, table)
         return agent

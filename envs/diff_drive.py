@@ -13,7 +13,7 @@ from mujoco.batch import Batch
 
 from gridnav.problem.geodesic import clearances
 from gridnav.problem.robot import BURGER, Robot
-from gridnav.problem.types import BoolArray, FloatArray, InputError, IntArray
+from gridnav.problem.types import BoolArray, FloatArray, InputError, IntArray, State
 
 from . import gl
 from .mjcf import build_model
@@ -139,6 +139,22 @@ class DiffDriveVectorEnv(RobotVectorEnv):
         if n_failed:
             # Back to the last good pose, so that what is observed stays finite.
             self._rest(np.flatnonzero(self._failed))
+
+    def get_state(self) -> State:
+        """Everything that decides what comes next, the engine's own state included."""
+        arrays, values = super().get_state()
+        return State(arrays | {"physics": np.array(self._batch.state)}, values)
+
+    def set_state(self, state: State) -> None:
+        """Go on where an environment that was made alike was: what follows is equal bit for bit.
+
+        Raises:
+            InputError: When the state is that of another kind or number of environments.
+        """
+        if "physics" not in state.arrays or state.arrays["physics"].shape != self._batch.state.shape:
+            raise InputError(f"the state is not that of {self.num_envs} environments of {self.world}")
+        super().set_state(state)
+        self._batch.state[:] = state.arrays["physics"]
 
     def render(self) -> tuple[Any, ...] | None:
         """A picture per environment, shape ``(height, width, 3)``, from the chosen camera.

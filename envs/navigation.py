@@ -9,6 +9,7 @@ from __future__ import annotations
 import numbers
 from abc import abstractmethod
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -22,7 +23,7 @@ from gridnav.problem.layout import Layout
 from gridnav.problem.reward import TERM_NAMES, Reward, Transition, TutorialReward, total
 from gridnav.problem.robot import BURGER, Robot
 from gridnav.problem.task import DRAWS_PER_EPISODE, EpisodeSampler, Task
-from gridnav.problem.types import AnyArray, BoolArray, Cell, FloatArray, InputError, IntArray
+from gridnav.problem.types import AnyArray, BoolArray, Cell, FloatArray, InputError, IntArray, State
 
 from .lidar import Lidar
 from .observation import FeatureVector
@@ -58,6 +59,22 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
 
     world: ClassVar[str]
     """Name of the world, as in the environment's id."""
+    STATE: ClassVar[tuple[str, ...]] = (
+        "pose",
+        "cell",
+        "speed",
+        "last_action",
+        "start",
+        "goal",
+        "goal_w",
+        "shortest_path_m",
+        "steps",
+        "collisions",
+        "path_length_m",
+        "travelled_m",
+        "failed",
+    )
+    """Arrays of the batch that decide what comes next, without their underscore; worlds add theirs."""
 
     def __init__(
         self,
@@ -198,6 +215,49 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
             info = self._next_episodes(np.flatnonzero(terminated | truncated), observations, info)
         return observations, total(terms), terminated, truncated, info
 
+    def get_state(self) -> State:
+        """Everything that decides what comes next, random streams and physics included."""
+        arrays = {name: getattr(self, f"_{name}").copy() for name in self.STATE}
+        arrays |= {f"transition.{f.name}": getattr(self._transition, f.name).copy() for f in fields(Transition)}
+        streams = self._streams.state()
+        arrays |= {f"streams.{name}": array for name, array in streams.arrays.items()}
+        fixed = {name: value if np.isscalar(value) else value.tolist() for name, value in self._fixed.items()}
+        layout = None if self.layout == self._own_layout else self.layout.to_text()
+        return State(arrays, {"fixed": fixed, "layout": layout, "has_reset": self._has_reset, **streams.values})
+
+    def set_state(self, state: State) -> None:
+        """Go on where an environment that was made alike was: what follows is equal bit for bit.
+
+        Raises:
+            InputError: When the state is that of another kind or number of environments.
+        """
+        arrays, values = state
+        poses = arrays.get("pose")
+        if poses is None or poses.shape != self._pose.shape or not set(self.STATE) <= arrays.keys():
+            raise InputError(f"the state is not that of {self.num_envs} environments of {self.world}")
+        layout = self._own_layout
+        if values["layout"] is not None:
+            layout = Layout.load(values["layout"], cell_size_m=layout.cell_size_m)
+        if layout != self.layout:
+            self.layout = layout
+            self._use_layout()
+        self._fixed = {
+            name: value if name == "heading_rad" else np.array(value) for name, value in values["fixed"].items()
+        }
+        self._goal[:] = arrays["goal"]
+        self._cell[:] = arrays["cell"]
+        self._pose[:] = arrays["pose"]
+        self._place(np.arange(self.num_envs))  # what follows from the above, such as the goals' numbers
+        for name in self.STATE:
+            getattr(self, f"_{name}")[:] = arrays[name]
+        for field in fields(Transition):
+            getattr(self._transition, field.name)[:] = arrays[f"transition.{field.name}"]
+        streams = {
+            name.removeprefix("streams."): array for name, array in arrays.items() if name.startswith("streams.")
+        }
+        self._streams.set_state(State(streams, values))
+        self._has_reset = values["has_reset"]
+
     @property
     def features(self) -> FeatureVector:
         """Names, units and bounds of the shared feature vector."""
@@ -336,9 +396,14 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         pose, goal_w, speed, last_action = state if ids is None else (part[ids] for part in state)
         return self._features.observe(pose, self._lidar.scan(pose), goal_w, speed, last_action)
 
-    def scan(self) -> FloatArray:
-        """Lidar ranges of all robots, shape ``(num_envs, n_beams)``, metres."""
-        return self._lidar.scan(self._pose)
+    def scan(self, poses: FloatArray | None = None) -> FloatArray:
+        """Lidar ranges where the robots are, or at other poses of shape ``(n, 3)``; metres, shape ``(n, n_beams)``."""
+        return self._lidar.scan(self._pose if poses is None else poses)
+
+    @property
+    def cells(self) -> IntArray:
+        """Where the robots are, (row, column), shape ``(num_envs, 2)``; a copy."""
+        return self._cell.copy()
 
     def _info(self, terms: dict[str, FloatArray]) -> dict[str, Any]:
         """The contract's keys, each a fresh array with a leading batch axis; the terms become part of it."""
@@ -397,6 +462,11 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         """Draw from these generators, one per environment; streams that already do go on where they are."""
         if any(new is not old for new, old in zip(generators, self._streams.generators, strict=True)):
             self._streams = RandomStreams(generators)
+
+    @property
+    def generators(self) -> list[np.random.Generator]:
+        """What the environments draw from, one each."""
+        return self._streams.generators
 
     def _generators(self, seed: int | Sequence[int]) -> list[np.random.Generator]:
         if isinstance(seed, int | np.integer):

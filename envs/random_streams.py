@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from gridnav.problem.types import FloatArray, IntArray
+from gridnav.problem.types import FloatArray, IntArray, State
 
 
 class RandomStreams:
@@ -32,6 +32,17 @@ class RandomStreams:
                 self._next[i] = 0
             _take(ids, self._block, self._next, numbers)
         return numbers
+
+    def state(self) -> State:
+        """Everything that decides the numbers to come."""
+        generators = [generator.bit_generator.state for generator in self.generators]
+        return State({"block": self._block.copy(), "next": self._next.copy()}, {"generators": generators})
+
+    def set_state(self, state: State) -> None:
+        """Go on where the streams of ``state`` were; the generators stay the same objects."""
+        for generator, values in zip(self.generators, state.values["generators"], strict=True):
+            generator.bit_generator.state = values
+        self._block[:], self._next[:] = state.arrays["block"], state.arrays["next"]
 
 
 @numba.njit(cache=True)

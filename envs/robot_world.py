@@ -38,6 +38,8 @@ class RobotVectorEnv(NavigationVectorEnv):
         shared: See ``NavigationVectorEnv``.
     """
 
+    STATE = (*NavigationVectorEnv.STATE, "contact", "contact_is_inner", "pressed_s", "begins", "refused")
+
     def __init__(self, num_envs: int = 1, *, control_period_s: float = 0.2, **shared: Any) -> None:
         if not 0.01 <= control_period_s <= 1.0:
             raise InputError(f"control_period_s {control_period_s} is outside 0.01 to 1 s")

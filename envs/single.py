@@ -10,7 +10,7 @@ import gymnasium as gym
 from gridnav.problem.layout import Layout
 from gridnav.problem.reward import Reward
 from gridnav.problem.task import Task
-from gridnav.problem.types import AnyArray
+from gridnav.problem.types import AnyArray, State
 
 from .navigation import NavigationVectorEnv, as_array
 from .observation import FeatureVector
@@ -47,6 +47,15 @@ class NavigationEnv(gym.Env[Any, Any], Generic[VectorWorld]):
         if self.render_mode == "human":
             self.render()
         return _one(observations), float(rewards[0]), bool(terminated[0]), bool(truncated[0]), _one_info(info)
+
+    def get_state(self) -> State:
+        """Everything that decides what comes next; see ``NavigationVectorEnv.get_state``."""
+        return self.worlds.get_state()
+
+    def set_state(self, state: State) -> None:
+        """Go on where another environment was; see ``NavigationVectorEnv.set_state``."""
+        self.worlds.set_state(state)
+        self.np_random = self.worlds.generators[0]  # later resets draw from it
 
     def render(self) -> Any:
         """A picture of the world in the form of ``render_mode``."""

@@ -1,13 +1,14 @@
 """The command line; the only module that prints.
 
 Exit codes: 0 done, 1 the lint found a fault, 2 bad input (one line on stderr, nothing written), 3 environment (disk,
-display, driver), 130 interrupted with a checkpoint written.
+lock, display, driver), 4 training stopped at numbers that are not finite, 130 interrupted with a checkpoint written.
 """
 
 from __future__ import annotations
 
 import contextlib
 import io
+import json
 import os
 import re
 import shlex
@@ -28,12 +29,23 @@ from gridnav.agents import OnProgress
 from gridnav.agents import Progress as Learning
 from gridnav.display.recording import ViewerError
 from gridnav.envs import RenderingError
-from gridnav.experiment.run_directory import RunDirectory, read_json, write_json
-from gridnav.experiment.training import BUDGETS, BudgetName, OnStage, Problem, Result
+from gridnav.experiment.checkpoint import clear_leftovers
+from gridnav.experiment.run_directory import CONFIG, RunDirectory, read_json, write_json
+from gridnav.experiment.training import (
+    BUDGETS,
+    CHECKPOINT_S,
+    OBSERVATIONS,
+    BudgetName,
+    Choice,
+    OnStage,
+    Problem,
+    Result,
+    check_choice,
+)
 from gridnav.problem.layout import NAMED_LAYOUTS, Layout
 from gridnav.problem.reward import Reward
 from gridnav.problem.task import Task
-from gridnav.problem.types import InputError
+from gridnav.problem.types import InputError, NonFiniteError
 
 Config = TypeVar("Config")
 stderr = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -61,8 +73,49 @@ class _Run:
     """Of everything that is random in training."""
     run_dir: Path | None = None
     """Where the run's files go; runs/<run-id> below the current folder by default."""
+    resume: bool = False
+    """Go on with the run in --run-dir where it was stopped or killed; its config says the rest."""
+    checkpoint_s: float = CHECKPOINT_S
+    """Seconds between two checkpoints of a training; 0 makes one at every opportunity."""
     config: Path | None = None
     """A run's config.json: makes that run again; flags after it change it."""
+
+    def _problem(self) -> tuple[Problem, dict[str, Any]]:
+        """The problem, and the configuration as JSON values that need no other file."""
+        if not 0 <= self.seed < 2**32:
+            raise InputError(f"--seed {self.seed} is outside 0 to 4294967295")
+        if not 0 <= self.checkpoint_s <= 86_400:
+            raise InputError(f"--checkpoint-s {self.checkpoint_s} is outside 0 to 86400 seconds")
+        problem = Problem.load(self.layout, self.task, self.reward)
+        layout = self.layout if self.layout in NAMED_LAYOUTS else problem.layout.to_text()
+        config = asdict(replace(self, layout=layout, **OF_ONE_START))
+        config = {key: value for key, value in config.items() if key not in OF_ONE_START and value is not None}
+        command = {kind: name for name, kind in COMMANDS.items()}[type(self)]
+        return problem, json.loads(json.dumps({"command": command, **config}))
+
+    @contextlib.contextmanager
+    def _directory(self, name: str, config: dict[str, Any]) -> Iterator[RunDirectory]:
+        """The run's directory, this process's own: a new one, or the one to go on with."""
+        if not self.resume or self.run_dir is None or not (self.run_dir / CONFIG).is_file():
+            if self.resume and self.run_dir is None:
+                raise InputError("--resume needs --run-dir: the run to go on with")
+            if self.resume:
+                stderr.print(f"nothing to resume in {str(self.run_dir)!r}: starting from the beginning", markup=False)
+            with RunDirectory.create(self.run_dir, name, config) as run:
+                yield run
+            return
+        run = RunDirectory.open(self.run_dir)
+        stored = run.read_config()
+        for key in stored.keys() | config.keys():
+            if stored.get(key) != config.get(key):
+                flag = f"--{key.replace('_', '-')}"
+                raise InputError(
+                    f"{flag} {config.get(key)!r:.60} is not what {str(self.run_dir)!r} was begun with "
+                    f"({stored.get(key)!r:.60}): leave it out, or begin another run"
+                )
+        with run.own():
+            clear_leftovers(run.checkpoints)
+            yield run
 
 
 @dataclass(frozen=True)
@@ -74,46 +127,63 @@ class Ladder(_Run):
         from gridnav.experiment.ladder import climb
 
         problem, config = self._problem()
-        run = RunDirectory.create(self.run_dir, "ladder", {"command": "ladder", **config})
-        with _progress() as on_stage:
-            results = climb(problem, BUDGETS[self.budget], self.seed, run, _again(run), config, on_stage)
+        budget = BUDGETS[self.budget]
+        with self._directory("ladder", config) as run, _progress() as on_stage:
+            results = climb(
+                problem, budget, self.seed, run, _again(run), config, on_stage, checkpoint_s=self.checkpoint_s
+            )
         _show(results, run)
         return 0
 
-    def _problem(self) -> tuple[Problem, dict[str, Any]]:
-        """The problem, and the configuration as JSON values that need no other file."""
-        if not 0 <= self.seed < 2**32:
-            raise InputError(f"--seed {self.seed} is outside 0 to 4294967295")
-        problem = Problem.load(self.layout, self.task, self.reward)
-        layout = self.layout if self.layout in NAMED_LAYOUTS else problem.layout.to_text()
-        config = asdict(replace(self, layout=layout, run_dir=None, config=None))
-        return problem, {key: value for key, value in config.items() if value is not None}
-
 
 @dataclass(frozen=True)
-class Train(Ladder):
-    """Train and evaluate one agent in one world."""
+class Train(_Run):
+    """Train and evaluate one agent in one world, or compare all that act on the grid."""
 
-    agent: Literal["plan", "q-learning", "ppo"] = "q-learning"
-    """Who learns: plan is value iteration and needs no learning."""
+    agent: Literal["plan", "q-learning", "dqn", "ppo", "all"] = "q-learning"
+    """Who learns: plan is value iteration and needs no learning; all trains and compares those of the grid."""
     env: Literal["gridnav/GridWorld-v0", "gridnav/Unicycle-v0", "gridnav/DiffDrive-v0"] | None = None
-    """Where; GridWorld for plan and q-learning, DiffDrive for ppo by default."""
+    """Where; DiffDrive for ppo and GridWorld for the others by default."""
+    observation: Literal["cell_goal", "cell", "features"] = "cell_goal"
+    """What an agent of the grid sees: its cell and the goal, its cell alone, or what the robots see."""
+    preset: str = ""
+    """Named hyper-parameters of the agent; by default those made for what it observes."""
+    set: tuple[str, ...] = ()
+    """Hyper-parameters that differ from the preset, such as double=false batch_size=64."""
 
     def __call__(self) -> int:
         """Run it."""
         from gridnav.experiment.results import train_and_report
-        from gridnav.experiment.training import check_fit
 
+        kinds = [kind for kind, seen in OBSERVATIONS.items() if self.observation in seen]
+        if self.agent != "all":
+            kinds = [self.agent]
         world = self.env.split("/")[1].removesuffix("-v0") if self.env else _home(self.agent)
-        check_fit(self.agent, world)
         problem, config = self._problem()
-        run = RunDirectory.create(self.run_dir, f"train-{self.agent}", {"command": "train", **config})
-        with _progress() as on_stage:
-            result = train_and_report(
-                problem, BUDGETS[self.budget], self.seed, self.agent, world, run, _again(run), config, on_stage
-            )
-        _show([result], run)
+        choice = Choice(self.preset, self._changes(), self.observation)
+        check_choice(kinds, world, choice)
+        budget = BUDGETS[self.budget]
+        with self._directory(f"train-{self.agent}", config) as run, _progress() as on_stage:
+            results = train_and_report(
+                problem, budget, self.seed, kinds, world, choice, run, _again(run), config, on_stage,
+                checkpoint_s=self.checkpoint_s,
+            )  # fmt: skip
+        _show(results, run)
         return 0
+
+    def _changes(self) -> dict[str, str]:
+        """The pairs of ``--set``."""
+        changes = {}
+        for pair in self.set:
+            name, equals, value = pair.partition("=")
+            if not equals or name == "seed":
+                raise InputError(f"--set {pair!r:.60} must be name=value, and the seed is --seed")
+            changes[name] = value
+        return changes
+
+
+OF_ONE_START: dict[str, Any] = {"run_dir": None, "resume": False, "checkpoint_s": CHECKPOINT_S, "config": None}
+"""Flags that are no part of a run's configuration: two starts of one run may differ in them."""
 
 
 @dataclass(frozen=True)
@@ -307,8 +377,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         code, message, cause = 2, str(error), error
     except (ViewerError, RenderingError, OSError) as error:
         code, message, cause = 3, str(error), error
+    except NonFiniteError as error:
+        code, message, cause = 4, str(error), error
     except KeyboardInterrupt as error:
-        code, message, cause = 130, "interrupted; a run's directory holds what it has learnt so far", error
+        code, message, cause = 130, "interrupted; --resume goes on from the run's last checkpoint", error
     if debug:
         stderr.print("".join(traceback.format_exception(cause)), markup=False)
     stderr.print(f"gridnav: {message}", markup=False)
@@ -346,18 +418,36 @@ def _parse(config: Callable[..., Config], name: str, words: list[str]) -> Config
 
 
 def _with_config(name: str, words: list[str]) -> list[str]:
-    """The flags of ``--config FILE`` in front of the others, so that both are checked alike and the others win."""
-    words = [part for word in words for part in (word.split("=", 1) if word.startswith("--config=") else [word])]
-    if "--config" not in words:
-        return words
-    at = words.index("--config")
-    if at + 1 == len(words):
-        raise InputError("--config needs a file: the config.json of a run")
-    stored = read_json(Path(words[at + 1]))
+    """The flags of ``--config FILE``, or of the run to resume, in front of the others, so that all are checked alike."""
+    words = [
+        part
+        for word in words
+        for part in (word.split("=", 1) if word.startswith(("--config=", "--run-dir=")) else [word])
+    ]
+    if "--config" in words:
+        at = words.index("--config")
+        if at + 1 == len(words):
+            raise InputError("--config needs a file: the config.json of a run")
+        return _flags(name, Path(words[at + 1])) + words[:at] + words[at + 2 :]
+    if "--resume" in words and "--run-dir" in words[:-1]:
+        config = Path(words[words.index("--run-dir") + 1]) / CONFIG
+        return (_flags(name, config) if config.is_file() else []) + words
+    return words
+
+
+def _flags(name: str, config: Path) -> list[str]:
+    """A stored configuration as words."""
+    stored = read_json(config)
     if stored.pop("command", name) != name:
-        raise InputError(f"--config {words[at + 1]} was made by another command than {name}")
-    flags = [f"--{key.replace('_', '-')}={value}" for key, value in stored.items()]
-    return flags + words[:at] + words[at + 2 :]
+        raise InputError(f"{str(config)!r} was made by another command than {name}")
+    flags = []
+    for key, value in stored.items():
+        flag = f"--{key.replace('_', '-')}"
+        if not isinstance(value, list):
+            flags.append(f"{flag}={value}")
+        elif value:
+            flags += [flag, *(str(one) for one in value)]
+    return flags
 
 
 def _help() -> None:

@@ -1,4 +1,4 @@
-"""Recordings are read back, figures are asked what they drew, and the report is parsed."""
+"""Recordings are read back, and the report is parsed."""
 
 from __future__ import annotations
 
@@ -13,12 +13,10 @@ import numpy as np
 import pytest
 import rerun as rr
 from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
-from matplotlib.quiver import Quiver
 from rerun.chunk import RrdReader
 
 from gridnav.display import palette
-from gridnav.display.figures import learning_curves, moving_average, save_figure, svg_text, trajectories, value_map
+from gridnav.display.figures import trajectories
 from gridnav.display.recording import ViewerError, open_viewer, screenshot, write_recording
 from gridnav.display.report import Picture, Report, Rung, write_report
 from gridnav.problem.layout import Layout
@@ -227,93 +225,6 @@ def test_without_a_display_the_viewer_names_the_alternatives(tmp_path: Path, mon
         open_viewer(tmp_path / "run.rrd")
     with pytest.raises(ViewerError, match="there is no recording"):
         open_viewer(tmp_path / "other.rrd")
-
-
-# ---- Figures -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("move", "direction"), [(0, (0, 1)), (1, (0, -1)), (2, (-1, 0)), (3, (1, 0))])
-def test_arrows_point_where_the_move_leads(move: int, direction: tuple[int, int]) -> None:
-    """Up is +y although it goes to a smaller row."""
-    values = np.zeros((15, 4))
-    values[7, move] = 1.0  # the middle of the second row... which is a wall, so no arrow
-    values[10, move] = 1.0  # row 2, column 0
-
-    figure = value_map(CORRIDOR, values, (0, 4))
-
-    (arrows,) = [item for item in figure.axes[0].collections if isinstance(item, Quiver)]
-    assert arrows.N == 1, "walls and cells without a preference carry no arrow"
-    np.testing.assert_allclose([arrows.X[0], arrows.Y[0]], [0.25, 0.25])
-    np.testing.assert_allclose(np.sign([arrows.U[0], arrows.V[0]]), direction)
-
-
-def test_the_value_map_shows_the_best_value_of_each_cell_with_row_0_on_top() -> None:
-    values = np.arange(60.0).reshape(15, 4)
-
-    axes = value_map(CORRIDOR, values, (0, 4)).axes[0]
-
-    (image,) = axes.images
-    shown = image.get_array()
-    assert image.get_extent() == [0, 2.5, 0, 1.5]
-    assert image.origin == "upper"
-    assert shown[0, 0] == 3.0
-    assert shown[2, 4] == 59.0
-    assert shown.mask[1].tolist() == [False, True, True, True, False]
-    assert shown.mask[0, 4], "nothing is earned after the goal"
-
-
-def test_trajectories_tell_success_from_failure_without_colour() -> None:
-    figure = trajectories(CORRIDOR, {"A": [drive(), drive(is_success=False, hits=(2, 3))], "B": [drive()]})
-
-    first, second = figure.axes
-    ways = [line for line in first.lines if line.get_gid() == "way"]
-    assert [line.get_linestyle() for line in ways] == ["-", "--"]
-    np.testing.assert_allclose(np.array(ways[0].get_data())[:, [0, -1]], [[0.25, 2.25], [1.25, 1.25]])
-    assert [line.get_marker() for line in first.lines].count("X") == 1
-    (collisions,) = [line for line in first.lines if line.get_gid() == "collisions"]
-    np.testing.assert_allclose(collisions.get_xdata(), [0.55, 0.65])  # by hand: 0.25 m + three and four tenths
-    assert first.get_title() == "A\n1 of 2 reached the goal"
-    assert (first.get_xlabel(), first.get_ylabel()) == ("x (m)", "y (m)")
-    assert first.get_ylim() == (0, 1.5)
-    assert len([line for line in second.lines if line.get_gid() == "way"]) == 1
-
-
-def test_the_moving_average_looks_back_and_never_ahead() -> None:
-    # By hand: 1, (1+2)/2, (2+3)/2, (3+8)/2.
-    np.testing.assert_allclose(moving_average(np.array([1.0, 2.0, 3.0, 8.0]), 2), [1.0, 1.5, 2.5, 5.5])
-
-
-def test_learning_curves_mark_the_target_and_keep_the_legend_off_the_data() -> None:
-    steps = np.arange(1, 21) * 1000
-    figure = learning_curves({"scratch": (steps, steps / 20000), "warm": (steps, np.ones(20))}, window=5)
-
-    axes = figure.axes[0]
-    (target,) = [line for line in axes.lines if line.get_gid() == "target"]
-    assert list(target.get_ydata()) == [0.95, 0.95]
-    averages = {line.get_label(): line for line in axes.lines}
-    np.testing.assert_allclose(averages["scratch"].get_ydata()[-1], 0.9)  # by hand: mean of 0.80, 0.85 ... 1.00
-    assert averages["scratch"].get_linestyle() != averages["warm"].get_linestyle()
-    figure.draw_without_rendering()
-    (legend,) = figure.legends
-    assert not legend.get_window_extent().overlaps(axes.get_window_extent())
-
-
-def test_figures_are_saved_by_suffix_and_names_are_no_formulas(tmp_path: Path) -> None:
-    figure = trajectories(CORRIDOR, {r"a $\frac{$ & <b>": [drive()]})
-
-    save_figure(figure, tmp_path / "a.png")
-    save_figure(figure, tmp_path / "a.svg")
-
-    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
-    assert "<svg" in (tmp_path / "a.svg").read_text()
-    assert svg_text(figure).startswith("<svg")
-
-
-def test_equal_figures_give_equal_svg() -> None:
-    def figure() -> Figure:
-        return value_map(CORRIDOR, np.arange(60.0).reshape(15, 4), (0, 4))
-
-    assert svg_text(figure()) == svg_text(figure())
 
 
 # ---- The report --------------------------------------------------------------------------------

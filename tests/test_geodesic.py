@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -274,6 +276,50 @@ def test_a_robot_without_a_radius_is_refused(radius_m: float) -> None:
     """A point would slip through the slack of the clearance test, that is through every wall."""
     with pytest.raises(InputError, match=r"radius_m .* must be a positive number of metres"):
         Geodesic(OPEN, radius_m)
+
+
+# ---- The way itself ----------------------------------------------------------------------------
+
+
+def test_in_the_open_the_way_is_its_two_ends() -> None:
+    np.testing.assert_array_equal(Geodesic(OPEN, RADIUS_M).path((1.0, 2.0), (3, 1)), [[1.0, 2.0], [0.75, 0.75]])
+
+
+def test_past_a_block_the_way_bends_at_its_corners() -> None:
+    way = Geodesic(BLOCK, RADIUS_M).path(np.array([1.75, 1.25, 0.0]), (2, 1))
+
+    # By hand: above or below the block, round two of its corners, half a turn in all.
+    np.testing.assert_array_equal(way[[0, -1]], [[1.75, 1.25], [0.75, 1.25]])
+    beside = np.abs(way[1:-1, 1] - 1.25)
+    assert ((beside > 0.25) & (beside <= 0.25 + 1.04 * RADIUS_M)).all()
+    legs = np.diff(way, axis=0)
+    turns = np.abs(np.diff(np.unwrap(np.arctan2(legs[:, 1], legs[:, 0]))))
+    # The tangents from both centres are 62.3 degrees of arc away from the top, see above, at each of two corners.
+    assert turns.sum() == pytest.approx(2 * np.radians(62.277), abs=0.1)
+
+
+def test_where_no_way_leads_there_is_no_point() -> None:
+    layout = Layout.from_text(".#.\n#.G\nS..\n")
+
+    assert Geodesic(layout, 0.01).path(layout.to_metres(np.array([0, 0])), (1, 2)).shape == (0, 2)
+
+
+@given(seed=st.integers(0, 2**32), density=st.sampled_from([0.1, 0.3]), radius_m=st.sampled_from([0.05, 0.2]))
+def test_the_way_is_as_long_as_its_distance_and_clears_the_walls(seed: int, density: float, radius_m: float) -> None:
+    layout = Layout.random(n_rows=7, n_cols=7, density=density, seed=seed)
+    geodesic = Geodesic(layout, radius_m)
+    rng = np.random.default_rng(seed)
+    cells = np.argwhere(layout.reachable)
+    for _ in range(5):
+        row, col = cells[rng.integers(len(cells))].tolist()
+        point = layout.to_metres(cells[rng.integers(len(cells))])
+
+        way = geodesic.path(point, (row, col))
+
+        assert np.hypot(*np.diff(way, axis=0).T).sum() == pytest.approx(geodesic.distance(point, (row, col)), abs=1e-9)
+        for begin, end in pairwise(way):
+            points = begin + np.linspace(0.0, 1.0, 60)[:, None] * (end - begin)
+            assert clearances(points, layout)[0].min() >= radius_m - 1e-6
 
 
 # ---- Clearances --------------------------------------------------------------------------------

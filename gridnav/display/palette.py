@@ -11,6 +11,13 @@ SERIES = (BLUE, ORANGE, GREEN, PURPLE, VERMILLION, SKY)
 """Colours of curves that stand side by side, in this order."""
 
 WALL, FLOOR, INK = "#5B6470", "#F4F5F7", "#1F2933"
+GRID_LINE = "#E4E7EB"
 START, GOAL, COLLISION = SKY, GREEN, VERMILLION
+ARRIVED, MISSED = BLUE, VERMILLION
+"""Ways that reached the goal, and those that did not."""
+ROBOT, ACTION = INK, ORANGE
+"""The robot's body, and the arrow of what it does."""
 SLOW, FAST = ORANGE, BLUE
 """Ends of the scale that shows a robot's speed."""
+REWARD_TERMS = {"goal": GREEN, "collision": VERMILLION, "distance": SKY, "time": ORANGE, "progress": BLUE}
+"""Each reward term is the same colour in all pictures."""

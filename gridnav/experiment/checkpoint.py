@@ -8,59 +8,117 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 import shutil
 import uuid
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from gridnav.agents import Agent, Planner, QLearning
-from gridnav.problem.types import InputError
+from gridnav.agents import Agent, Planner, QLearning, read_state, write_state
+from gridnav.problem.types import InputError, IntArray, State
 
-FORMAT = 1
+FORMAT = 2
 KEPT = 2
 """Checkpoints that pruning leaves."""
 MANIFEST = "manifest.json"
 LIBRARIES = ("gridnav", "numpy", "torch", "mujoco", "gymnasium", "stable-baselines3", "rerun-sdk")
 """What decides a run's numbers and files, in checkpoints and reports."""
+LARGEST = 1 << 30
+"""Bytes of the largest part that is read."""
+log = logging.getLogger("gridnav")
 
 
-def save_agent(agent: Agent, directory: Path, step: int, *, name: str) -> Path:
-    """Write an agent as ``step-000000012345`` into a directory of checkpoints.
+@dataclass(frozen=True)
+class Standing:
+    """Where a run stood when a checkpoint was written."""
+
+    steps: int = 0
+    """Environment steps of this agent's training so far."""
+    seconds: float = 0.0
+    """Wall-clock time of this agent's training so far."""
+    run_steps: int = 0
+    """Environment steps of all agents of the run so far."""
+    log_bytes: int = 0
+    """Length of the run's metrics, which a continued run cuts back to."""
+    is_finished: bool = False
+    """This agent's training is over."""
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What a checkpoint holds."""
+
+    agent: Agent
+    """As it was."""
+    standing: Standing
+    """Where the run stood."""
+    training: State | None
+    """What the learner needs to go on; none where its training is over."""
+    worlds: State | None
+    """The same of the environments."""
+    visits: IntArray | None = None
+    """How often a robot was seen in each cell, shape ``(n_rows, n_cols)``."""
+
+
+def save_checkpoint(directory: Path, name: str, checkpoint: Checkpoint) -> Path:
+    """Write a checkpoint as ``step-000000012345`` into a directory of checkpoints.
 
     Args:
-        agent: What to save.
         directory: Made if it does not exist.
-        step: Environment steps the run has taken so far; the next free number is taken where two agents share one.
         name: Which of the run's agents it is; older checkpoints of the same name are pruned.
+        checkpoint: What to save. The directory's number is that of the run's steps, or the next free one.
 
     Returns:
         The checkpoint's directory.
+
+    Raises:
+        OSError: When the disk is full or may not be written; what was saved before is intact, nothing else is left.
     """
     directory.mkdir(parents=True, exist_ok=True)
     aside = directory / f".tmp-{uuid.uuid4().hex}"
-    aside.mkdir()
-    agent.save(aside)
-    parts = {part.name: _digest(part) for part in sorted(aside.iterdir())}
+    try:
+        aside.mkdir()
+        _write(aside, name, checkpoint)
+        final = _fresh(directory, checkpoint.standing.run_steps)
+        aside.rename(final)
+    except BaseException:
+        shutil.rmtree(aside, ignore_errors=True)
+        raise
+    _sync(directory)
+    for old in _whole(directory, name)[KEPT:]:
+        shutil.rmtree(old)
+    return final
+
+
+def save_agent(agent: Agent, directory: Path, step: int, *, name: str) -> Path:
+    """A checkpoint of an agent that has learnt; see ``save_checkpoint``."""
+    standing = Standing(steps=step, run_steps=step, is_finished=True)
+    return save_checkpoint(directory, name, Checkpoint(agent, standing, None, None))
+
+
+def _write(aside: Path, name: str, checkpoint: Checkpoint) -> None:
+    checkpoint.agent.save(aside)
+    visits = None if checkpoint.visits is None else State({"visits": checkpoint.visits}, {})
+    for part, state in (("training", checkpoint.training), ("worlds", checkpoint.worlds), ("visits", visits)):
+        if state is not None:
+            write_state(state, aside, part)
     manifest = {
         "format": FORMAT,
         "name": name,
-        "kind": agent.kind,
-        "step": step,
-        "versions": {name: version(name) for name in LIBRARIES},
-        "parts": parts,
+        "kind": checkpoint.agent.kind,
+        "step": checkpoint.standing.run_steps,
+        "standing": asdict(checkpoint.standing),
+        "versions": {library: version(library) for library in LIBRARIES},
+        "torch_threads": 1,
+        "parts": {part.name: _digest(part) for part in sorted(aside.iterdir())},
     }
     (aside / MANIFEST).write_text(json.dumps(manifest, indent=2), encoding="utf-8")
-    for part in aside.iterdir():
-        _sync(part)
+    for file in aside.iterdir():
+        _sync(file)
     _sync(aside)
-    final = _fresh(directory, step)
-    aside.rename(final)
-    _sync(directory)
-    for old in _checkpoints(directory, name)[KEPT:]:
-        shutil.rmtree(old)
-    return final
 
 
 def _fresh(directory: Path, step: int) -> Path:
@@ -70,25 +128,86 @@ def _fresh(directory: Path, step: int) -> Path:
     return final
 
 
-def load_agent(directory: Path, name: str) -> Agent:
-    """An agent of a run, from its newest whole checkpoint.
+def load_checkpoint(directory: Path, name: str) -> Checkpoint | None:
+    """The newest whole checkpoint of one of a run's agents, or none where there is none at all.
+
+    A damaged one is passed over for the one before, and said so on the log.
 
     Args:
         directory: A directory of checkpoints.
         name: Which of the run's agents.
 
     Raises:
-        InputError: When it holds none that verifies.
+        InputError: When there are checkpoints of that agent and none is whole, or what they hold is no agent.
     """
-    for checkpoint in _checkpoints(directory, name):
-        return _agent_class(_manifest(checkpoint)["kind"]).load(checkpoint)
-    raise InputError(f"{str(directory)!r} holds no whole checkpoint of {name!r}")
+    faults: list[str] = []
+    for path in _newest_first(directory):
+        fault = _fault(path)
+        if not fault and _manifest(path)["name"] == name:
+            if faults:
+                log.warning("passed over damaged checkpoints, going back to %s: %s", path.name, faults[0])
+            return _load(path)
+        if fault:
+            faults.append(fault)
+    if faults:
+        raise InputError(f"{str(directory)!r} holds no whole checkpoint of {name!r}: {faults[0]}")
+    return None
 
 
-def _checkpoints(directory: Path, name: str) -> list[Path]:
+def _load(path: Path) -> Checkpoint:
+    manifest = _manifest(path)
+    try:
+        agent = _agent_class(manifest["kind"]).load(path)
+        training, worlds, visits = (
+            read_state(path, part) if f"{part}.json" in manifest["parts"] else None
+            for part in ("training", "worlds", "visits")
+        )
+        standing = Standing(**manifest["standing"])
+        return Checkpoint(agent, standing, training, worlds, visits.arrays["visits"] if visits else None)
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise InputError(f"checkpoint {str(path)!r} cannot be used: {error}") from error
+
+
+def load_agent(directory: Path, name: str) -> Agent:
+    """An agent of a run, from its newest whole checkpoint.
+
+    Raises:
+        InputError: When there is none; see ``load_checkpoint``.
+    """
+    checkpoint = load_checkpoint(directory, name)
+    if checkpoint is None:
+        raise InputError(f"{str(directory)!r} holds no checkpoint of {name!r}")
+    return checkpoint.agent
+
+
+def last_standing(directory: Path) -> Standing:
+    """Where a run stood in its newest whole checkpoint, of whichever agent; at its beginning without one."""
+    for path in _newest_first(directory):
+        if not _fault(path):
+            return Standing(**_manifest(path)["standing"])
+    return Standing()
+
+
+def clear_leftovers(directory: Path) -> None:
+    """Remove what a killed run was writing aside; only for the run's owner."""
+    for left in directory.glob(".tmp-*"):
+        shutil.rmtree(left, ignore_errors=True)
+
+
+def _newest_first(directory: Path) -> list[Path]:
+    return sorted(directory.glob("step-*"), reverse=True)
+
+
+def _whole(directory: Path, name: str) -> list[Path]:
     """Whole checkpoints of one agent, newest first."""
-    newest_first = sorted(directory.glob("step-*"), reverse=True)
-    return [path for path in newest_first if _is_whole(path) and _manifest(path)["name"] == name]
+    return [path for path in _newest_first(directory) if _is_of(path, name) and not _fault(path)]
+
+
+def _is_of(checkpoint: Path, name: str) -> bool:
+    try:
+        return bool(_manifest(checkpoint)["name"] == name)
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return False
 
 
 def _manifest(checkpoint: Path) -> dict[str, Any]:
@@ -101,23 +220,39 @@ def _agent_class(kind: str) -> type[Agent]:
         from gridnav.agents import PPOAgent  # torch takes seconds to import
 
         return PPOAgent
+    if kind == "dqn":
+        from gridnav.agents import DQNAgent
+
+        return DQNAgent
     for known in (Planner, QLearning):
         if known.kind == kind:
             return known
-    raise InputError(f"the checkpoint holds an agent of the unknown kind {kind!r}")
+    raise InputError(f"the checkpoint holds an agent of the unknown kind {kind!r:.60}")
 
 
-def _is_whole(checkpoint: Path) -> bool:
+def _fault(checkpoint: Path) -> str:
+    """Why a checkpoint is not whole, in words; empty if it is."""
     try:
         manifest = _manifest(checkpoint)
         parts: dict[str, dict[str, object]] = manifest["parts"]
-        # Names come from a file: only plain ones inside the checkpoint are looked at.
-        plain = all(name == Path(name).name for name in parts)
-        named = isinstance(manifest["name"], str) and isinstance(manifest["kind"], str)
-        complete = manifest["format"] == FORMAT and set(Agent.files) <= parts.keys()
-        return plain and named and complete and all(_digest(checkpoint / n) == d for n, d in parts.items())
+        if manifest["format"] != FORMAT:
+            return f"{checkpoint.name} has format {manifest['format']!r:.20}, not {FORMAT}"
+        if not isinstance(manifest["name"], str) or not isinstance(manifest["kind"], str):
+            return f"{checkpoint.name}/{MANIFEST} is damaged"
+        if not {"agent.safetensors", "agent.json"} <= parts.keys():
+            return f"{checkpoint.name}/{MANIFEST} names no agent"
+        Standing(**manifest["standing"])
+        for part, expected in parts.items():
+            # Names come from a file: only plain ones inside the checkpoint are looked at.
+            if part != Path(part).name or (checkpoint / part).is_symlink():
+                return f"{checkpoint.name}/{MANIFEST} names {part!r:.60}, which is no file of its own"
+            if not (checkpoint / part).is_file():
+                return f"{checkpoint.name}/{part} is missing"
+            if (checkpoint / part).stat().st_size > LARGEST or _digest(checkpoint / part) != expected:
+                return f"{checkpoint.name}/{part} is damaged: its SHA-256 is not that of {MANIFEST}"
+        return ""
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return False
+        return f"{checkpoint.name}/{MANIFEST} is missing or damaged"
 
 
 def _digest(part: Path) -> dict[str, object]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any
 
 import gymnasium as gym
@@ -12,8 +13,10 @@ from numpy.typing import NDArray
 
 from gridnav.agents import Agent, OnProgress, Progress, TabularAgent
 from gridnav.envs import Lidar, MoveDriver, NavigationVectorEnv
-from gridnav.problem.metrics import Episode, Trace
-from gridnav.problem.types import AnyArray
+from gridnav.problem.behaviour import diagnose
+from gridnav.problem.geodesic import Geodesic
+from gridnav.problem.metrics import Episode, Trace, driving_time, measure_motion
+from gridnav.problem.types import AnyArray, Cell
 
 EVALUATION_SEED = 1_000_000
 """Seed of the evaluation episodes; no training uses it."""
@@ -103,7 +106,7 @@ def evaluate(
             ended = n - int(running.sum())
             arrived = sum(bool(one["is_success"]) for one in last if one)
             on_progress(Progress(ended, n, {"success_rate": arrived / max(ended, 1)}))
-    return [course.episode(i, last[i]) for i in range(n)]
+    return course.episodes(last)
 
 
 class _Course:
@@ -111,8 +114,9 @@ class _Course:
 
     def __init__(self, worlds: NavigationVectorEnv) -> None:
         self._worlds = worlds
+        self._on_grid = isinstance(worlds.single_action_space, Discrete)
         self._lidar = Lidar(worlds.layout, worlds.robot)
-        self._starts, self._goals = worlds._start.copy(), worlds._goal.copy()
+        self._ends = [worlds.start_and_goal(i) for i in range(worlds.num_envs)]
         self._poses: list[AnyArray] = []
         self._scans: list[AnyArray] = []
         self._actions: list[AnyArray] = []
@@ -133,30 +137,58 @@ class _Course:
         self._terms.append(reached["reward_terms"])
         self.add_state(reached)
 
-    def episode(self, i: int, last: dict[str, Any]) -> Episode:
-        seconds = float(last["elapsed_s"])
+    def episodes(self, last: list[dict[str, Any]]) -> list[Episode]:
+        """One record per environment, given the info in which its first episode ended."""
+        poses, scans, actions = (np.stack(part, axis=1) for part in (self._poses, self._scans, self._actions))
+        rewards, hits = np.stack(self._rewards, axis=1), np.stack(self._hits, axis=1).astype(np.int64)
+        terms = {name: np.stack([one[name] for one in self._terms], axis=1) for name in self._terms[0]}
         step_s = self._worlds.step_s
-        steps = round(seconds / step_s)
-        names = self._terms[0]
-        trace = Trace(
-            time_s=np.arange(steps + 1) * step_s,
-            poses=np.stack([poses[i] for poses in self._poses[: steps + 1]]),
-            scans_m=np.stack([scans[i] for scans in self._scans[: steps + 1]]),
-            actions=np.stack([actions[i] for actions in self._actions[:steps]]),
-            reward_terms={name: np.array([terms[name][i] for terms in self._terms[:steps]]) for name in names},
-            hits=np.array([hits[i] for hits in self._hits[:steps]], dtype=np.int64),
-        )
+        times = np.arange(poses.shape[1]) * step_s
+        records = []
+        for i, info in enumerate(last):
+            n = round(float(info["elapsed_s"]) / step_s)
+            # Copies: a record should not keep the whole batch in memory.
+            trace = Trace(
+                time_s=times[: n + 1],
+                poses=poses[i, : n + 1].copy(),
+                scans_m=scans[i, : n + 1].copy(),
+                actions=actions[i, :n].copy(),
+                reward_terms={name: shares[i, :n].copy() for name, shares in terms.items()},
+                hits=hits[i, :n].copy(),
+            )
+            records.append(self._episode(i, info, trace, float(rewards[i, :n].sum())))
+        return records
+
+    def _episode(self, i: int, info: dict[str, Any], trace: Trace, episode_return: float) -> Episode:
+        layout, robot = self._worlds.layout, self._worlds.robot
+        start, goal = self._ends[i]
         return Episode(
-            start=(int(self._starts[i, 0]), int(self._starts[i, 1])),
-            goal=(int(self._goals[i, 0]), int(self._goals[i, 1])),
-            is_success=bool(last["is_success"]),
-            collisions=int(last["collisions"]),
-            path_length_m=float(last["path_length_m"]),
-            shortest_path_m=float(last["shortest_path_m"]),
-            elapsed_s=seconds,
-            shortest_time_s=float(last["shortest_path_m"]) / self._worlds.robot.max_speed_m_s,
-            steps=steps,
-            episode_return=float(sum(rewards[i] for rewards in self._rewards[:steps])),
-            physics_error=bool(last.get("physics_error", False)),
+            start=start,
+            goal=goal,
+            is_success=bool(info["is_success"]),
+            collisions=int(info["collisions"]),
+            path_length_m=float(info["path_length_m"]),
+            shortest_path_m=float(info["shortest_path_m"]),
+            elapsed_s=float(info["elapsed_s"]),
+            shortest_time_s=self._shortest_time(float(info["shortest_path_m"]), goal, trace),
+            steps=len(trace.actions),
+            episode_return=episode_return,
+            physics_error=bool(info.get("physics_error", False)),
             trace=trace,
+            goal_radius_m=0.0 if self._on_grid else self._worlds.task.goal_radius_m,
+            motion=measure_motion(trace, layout, robot),
+            behaviours=diagnose(trace, goal_w=layout.to_metres(np.array(goal)), layout=layout, robot=robot),
         )
+
+    def _shortest_time(self, shortest_path_m: float, goal: Cell, trace: Trace) -> float:
+        """A cell-time for each move on the grid; for a robot, turns and straight legs to the edge of the goal."""
+        robot = self._worlds.robot
+        if self._on_grid:
+            return shortest_path_m / robot.max_speed_m_s
+        x, y, heading = trace.poses[0]
+        path = self._geodesic.path(np.array([x, y]), goal)
+        return driving_time(path, heading, robot, self._worlds.task.goal_radius_m)
+
+    @cached_property
+    def _geodesic(self) -> Geodesic:
+        return Geodesic(self._worlds.layout, self._worlds.robot.radius_m)

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gridnav.agents import TabularAgent
+from gridnav.experiment.pictures import pictures
 from gridnav.experiment.results import (
-    pictures,
+    open_log,
     report_rows,
     write_evaluation,
     write_page,
     write_rollout,
 )
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
-from gridnav.experiment.training import Budget, OnStage, Problem, Result, Workshop
+from gridnav.experiment.training import Budget, OnStage, Problem, Result, Trained, Workshop
 
 QUESTION = (
     "How far does a table learnt on the grid carry a wheeled robot, and what does a network save that "
@@ -32,6 +32,8 @@ def climb(
     command: str,
     config: Mapping[str, Any],
     on_stage: OnStage,
+    *,
+    checkpoint_s: float,
 ) -> list[Result]:
     """All rungs, in order, written to a run directory.
 
@@ -43,9 +45,10 @@ def climb(
         command: What makes the run again, for the report.
         config: The run's configuration, for the report.
         on_stage: Told of every training and evaluation.
+        checkpoint_s: Seconds between two checkpoints of a training.
     """
-    with MetricsLog(run) as log:
-        workshop = Workshop(problem, budget, seed, run, log, on_stage)
+    with open_log(run) as log:
+        workshop = Workshop(problem, budget, seed, run, log, on_stage, checkpoint_s=checkpoint_s)
         plan = workshop.train("plan", "plan", "GridWorld")
         results = [workshop.evaluate("plan", plan, "GridWorld", "value iteration")]
 
@@ -65,8 +68,7 @@ def climb(
         warm = workshop.train("ppo-warm", "ppo", "DiffDrive", start=unicycle.agent)
         results.append(workshop.evaluate("ppo-warm", warm, "DiffDrive", "PPO warm-started", carried=network))
 
-        assert isinstance(table.agent, TabularAgent)
-        _write(problem, seed, run, command, config, results, table.agent, log)
+        _write(problem, seed, run, command, config, results, [table, warm], log)
     return results
 
 
@@ -77,7 +79,7 @@ def _write(
     command: str,
     config: Mapping[str, Any],
     results: Sequence[Result],
-    table: TabularAgent,
+    trained: Sequence[Trained],
     log: MetricsLog,
 ) -> None:
     write_evaluation(run, results, seed)
@@ -91,7 +93,7 @@ def _write(
         "ppo-scratch": "DiffDrive, from scratch",
         "ppo-warm": "DiffDrive, warm-started",
     }
-    shown = pictures(run, problem, results, curves, table, log)
+    shown = pictures(run, problem, results, trained, curves, log)
     write_page(
         run,
         title=f"The ladder on {problem.layout.name}",

@@ -9,20 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from gridnav.agents import TabularAgent
-from gridnav.display.figures import learning_curves, save_figure, trajectories, value_map
 from gridnav.display.recording import write_recording
 from gridnav.display.report import Picture, Report, Rung, write_report
-from gridnav.experiment.checkpoint import LIBRARIES, load_agent
+from gridnav.experiment.checkpoint import LIBRARIES, last_standing, load_agent
 from gridnav.experiment.evaluation import EVALUATION_SEED, evaluate, policy_for
+from gridnav.experiment.pictures import pictures
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory, read_json, write_json
-from gridnav.experiment.training import AgentKind, Budget, OnStage, Problem, Result, Workshop
-from gridnav.problem.geodesic import cell_distances
+from gridnav.experiment.training import AgentKind, Budget, Choice, OnStage, Problem, Result, Workshop, grid_options
 from gridnav.problem.types import InputError
 
-DRAWN_EPISODES = 40
-"""Ways drawn per panel: more would hide each other and swell the page."""
-_NEEDED = ("world", "agent", "carried", "checkpoint")
+_NEEDED = ("world", "agent", "carried", "checkpoint", "observation")
 
 
 def write_evaluation(run: RunDirectory, results: Sequence[Result], seed: int) -> None:
@@ -38,6 +34,7 @@ def evaluation(results: Sequence[Result]) -> dict[str, Any]:
             "agent": result.agent,
             "carried": result.carried,
             "checkpoint": result.checkpoint,
+            "observation": result.observation,
             **asdict(result.summary),
             "training_steps": result.steps,
             "training_seconds": result.seconds,
@@ -56,55 +53,6 @@ def write_rollout(
     number = int(finished.argmax())
     rollouts = {f"{result.agent} on {result.world}": result.episodes[number] for result in results}
     write_recording(run.recording, problem.layout, rollouts, title=f"gridnav {run.path.name}", properties=properties)
-
-
-def pictures(
-    run: RunDirectory,
-    problem: Problem,
-    results: Sequence[Result],
-    curves: Mapping[str, str],
-    table: TabularAgent | None,
-    log: MetricsLog,
-) -> list[Picture]:
-    """The figures of a run, each also as a PNG file.
-
-    Args:
-        run: Where the files go.
-        problem: Gives the maze.
-        results: One panel of trajectories each.
-        curves: Series of the metrics to draw the success rate of, with their labels.
-        table: Its values and moves are drawn for one goal.
-        log: The metrics.
-    """
-    drawn = {f"{result.agent} on {result.world}": result.episodes[:DRAWN_EPISODES] for result in results}
-    shown = {
-        "trajectories": Picture(
-            trajectories(problem.layout, drawn),
-            f"The ways of the first {min(DRAWN_EPISODES, len(results[0].episodes))} evaluation episodes, the same "
-            "starts and goals in every panel.",
-        )
-    }
-    series = {label: log.curve(name, "success_rate") for name, label in curves.items()}
-    series = {label: curve for label, curve in series.items() if len(curve[0]) > 1}
-    if series:
-        shown["learning"] = Picture(
-            learning_curves({label: (np.array(x), np.array(y)) for label, (x, y) in series.items()}),
-            "Success rate over the last 400 training episodes, exploration included, against environment steps.",
-        )
-    if table is not None:
-        goals = problem.task.goal_cells(problem.layout)
-        goal = (int(goals[-1, 0]), int(goals[-1, 1]))
-        moves = table.action_values.reshape(problem.layout.n_cells, len(goals), 4)[:, -1]
-        # The shaping moves values by the distance; without it they grow towards the goal, as a reader expects.
-        distance = cell_distances(problem.layout, goal).ravel()
-        moves = moves + problem.reward.potential(np.where(np.isfinite(distance), distance, 0.0))[:, None]
-        shown["values"] = Picture(
-            value_map(problem.layout, moves, goal),
-            f"Values and preferred moves of the learnt table for the goal at cell {goal}, the shaping taken out.",
-        )
-    for name, picture in shown.items():
-        save_figure(picture.figure, run.figures / f"{name}.png")
-    return list(shown.values())
 
 
 def report_rows(results: Sequence[Result], seed: int) -> list[Rung]:
@@ -156,47 +104,60 @@ def train_and_report(
     problem: Problem,
     budget: Budget,
     seed: int,
-    kind: AgentKind,
+    kinds: Sequence[AgentKind],
     world: str,
+    choice: Choice,
     run: RunDirectory,
     command: str,
     config: Mapping[str, Any],
     on_stage: OnStage,
-) -> Result:
-    """Train one agent, evaluate it and write everything a run holds.
+    *,
+    checkpoint_s: float,
+) -> list[Result]:
+    """Train agents in a world, evaluate them and write everything a run holds.
 
     Args:
         problem: What is to be solved.
         budget: How much may be spent.
         seed: Of everything that is random in training.
-        kind: Who learns.
+        kinds: Who learns; several are compared.
         world: Where.
-        run: Where the files go.
+        choice: Hyper-parameters and observation.
+        run: Where the files go; a run that was stopped goes on.
         command: What makes the run again, for the report.
         config: The run's configuration, for the report.
-        on_stage: Told of the training and the evaluation.
+        on_stage: Told of the trainings and evaluations.
+        checkpoint_s: Seconds between two checkpoints of a training.
     """
-    with MetricsLog(run) as log:
-        workshop = Workshop(problem, budget, seed, run, log, on_stage)
-        trained = workshop.train(kind, kind, world)
-        result = workshop.evaluate(kind, trained, world, kind)
-        write_evaluation(run, [result], seed)
-        write_rollout(run, problem, [result], {"command": command, "training seed": seed})
-        table = trained.agent if isinstance(trained.agent, TabularAgent) else None
-        shown = pictures(run, problem, [result], {kind: f"{kind} on {world}"}, table, log)
-    low, high = result.summary.success_interval
+    with open_log(run) as log:
+        workshop = Workshop(problem, budget, seed, run, log, on_stage, checkpoint_s=checkpoint_s)
+        trained = [workshop.train(kind, kind, world, choice=choice) for kind in kinds]
+        results = [workshop.evaluate(one.name, one, world, one.name) for one in trained]
+        write_evaluation(run, results, seed)
+        write_rollout(run, problem, results, {"command": command, "training seed": seed})
+        shown = pictures(run, problem, results, trained, {kind: f"{kind} on {world}" for kind in kinds}, log)
+    names, many = " and ".join(kinds), len(kinds) > 1
+    found = [
+        f"{result.name} reaches the goal in {result.summary.success_rate:.1%} of {len(result.episodes)} episodes "
+        f"(95 % interval {result.summary.success_interval[0]:.1%} to {result.summary.success_interval[1]:.1%})"
+        for result in results
+    ]
     write_page(
         run,
-        title=f"{kind} on {world}, {problem.layout.name}",
-        question=f"How well does {kind} solve {world}?",
-        conclusion=f"It reaches the goal in {result.summary.success_rate:.1%} of {len(result.episodes)} episodes "
-        f"(95 % interval {low:.1%} to {high:.1%}).",
-        rows=report_rows([result], seed),
+        title=f"{names} on {world}, {problem.layout.name}",
+        question=f"How well {'do' if many else 'does'} {names} solve {world}?",
+        conclusion="; ".join(found) + ".",
+        rows=report_rows(results, seed),
         shown=shown,
         command=command,
         config=config,
     )
-    return result
+    return results
+
+
+def open_log(run: RunDirectory) -> MetricsLog:
+    """A run's metrics, cut back to where its checkpoints stand."""
+    return MetricsLog(run, last_standing(run.checkpoints).log_bytes)
 
 
 def evaluate_again(run: RunDirectory, episodes: int, seed: int | None, on_stage: OnStage) -> list[Result]:
@@ -220,11 +181,11 @@ def evaluate_again(run: RunDirectory, episodes: int, seed: int | None, on_stage:
     results = []
     for name, row in rows.items():
         agent = load_agent(run.checkpoints, row["checkpoint"])
-        worlds = problem.worlds(row["world"], episodes)
+        worlds = problem.worlds(row["world"], episodes, **grid_options(row["world"], row["observation"]))
         report = on_stage(f"evaluating {name}")
         records = evaluate(
             policy_for(agent, worlds), worlds, seed=EVALUATION_SEED if seed is None else seed, on_progress=report
         )
         worlds.close()
-        results.append(Result(name, row["world"], row["agent"], row["carried"], row["checkpoint"], records))
+        results.append(Result(name, episodes=records, **row))
     return results

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
+import socket
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from filelock import FileLock, Timeout
 from tensorboard.compat.proto.event_pb2 import Event
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
@@ -24,6 +28,13 @@ CONFIG, METRICS, EVALUATION, REPORT, RECORDING = (
 )
 
 
+LOCK, OWNER = ".lock", ".owner"
+
+
+class RunInUseError(OSError):
+    """Another process owns the run directory."""
+
+
 class RunDirectory:
     """``runs/<run-id>/`` with config, metrics, evaluation, report, recording, figures and checkpoints."""
 
@@ -32,10 +43,12 @@ class RunDirectory:
         self.config, self.evaluation = path / CONFIG, path / EVALUATION
         self.report, self.recording = path / REPORT, path / RECORDING
         self.figures, self.checkpoints = path / "figures", path / "checkpoints"
+        self._lock, self._owner = path / LOCK, path / OWNER
 
     @classmethod
-    def create(cls, path: Path | None, name: str, config: Mapping[str, Any]) -> Self:
-        """A new run with its config on disk.
+    @contextmanager
+    def create(cls, path: Path | None, name: str, config: Mapping[str, Any]) -> Iterator[Self]:
+        """A new run with its config on disk, this process's own until the context ends.
 
         Args:
             path: Where; ``runs/<name>-<time>`` below the current folder by default.
@@ -44,20 +57,54 @@ class RunDirectory:
 
         Raises:
             InputError: When the directory exists and is not empty, so that no run is ever overwritten.
+            RunInUseError: When another process owns it.
         """
-        if path is None:
-            stamp = time.strftime("%Y%m%d-%H%M%S")
-            path = Path("runs") / f"{name}-{stamp}"
-            for count in range(2, 100):
-                if not path.exists():
-                    break
-                path = Path("runs") / f"{name}-{stamp}-{count}"
-        if path.exists() and (not path.is_dir() or any(path.iterdir())):
-            raise InputError(f"run directory {str(path)!r} exists and is not empty: name another with --run-dir")
-        run = cls(path)
-        run.figures.mkdir(parents=True)
-        write_json(run.config, config)
-        return run
+        run = cls(_free_path(name) if path is None else path)
+        if run._lock.exists():
+            with run.own():  # says who owns it, if somebody does
+                pass
+        if run.path.exists() and not run.is_fresh:
+            raise InputError(f"run directory {str(run.path)!r} exists and is not empty: name another with --run-dir")
+        run.path.mkdir(parents=True, exist_ok=True)
+        with run.own():
+            if not run.is_fresh:
+                raise InputError(
+                    f"run directory {str(run.path)!r} was taken by another run: name another with --run-dir"
+                )
+            run.figures.mkdir(exist_ok=True)
+            write_json(run.config, config)
+            yield run
+
+    @contextmanager
+    def own(self) -> Iterator[None]:
+        """Keep other processes out of the run; the system ends it with this process, whatever ends that.
+
+        Raises:
+            RunInUseError: When another process owns the run; the message names it.
+        """
+        lock = FileLock(self._lock)
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            try:
+                owner = self._owner.read_text(encoding="utf-8").strip()
+            except OSError:
+                owner = "another process"
+            words = f"run directory {str(self.path)!r} is in use by {owner}: wait for it or stop it"
+            raise RunInUseError(words) from None
+        try:
+            self._owner.write_text(f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8")
+            yield
+        finally:
+            lock.release()
+
+    @property
+    def is_fresh(self) -> bool:
+        """Nothing was ever run here: the directory is empty but for what a start that was killed leaves."""
+        if not self.path.is_dir():
+            return False
+        left = {entry.name for entry in self.path.iterdir()}
+        return left <= {LOCK, OWNER, self.figures.name, f".tmp-{CONFIG}"} and not any(self.figures.glob("*"))
 
     @classmethod
     def open(cls, path: Path) -> Self:
@@ -80,24 +127,59 @@ class RunDirectory:
 
 
 class MetricsLog:
-    """Rows of numbers to ``metrics.jsonl`` and to TensorBoard, keyed by series and environment steps."""
+    """Rows of numbers to ``metrics.jsonl`` and to TensorBoard, keyed by series and environment steps.
 
-    def __init__(self, run: RunDirectory) -> None:
-        self._file = (run.path / METRICS).open("a", encoding="utf-8")
+    Args:
+        run: Whose.
+        keep_bytes: Length of what a continued run keeps of its metrics; later rows will be written again.
+
+    Raises:
+        InputError: When there is less than that to keep.
+    """
+
+    def __init__(self, run: RunDirectory, keep_bytes: int = 0) -> None:
+        self._rows: dict[str, list[dict[str, float]]] = {}
+        self._file = (run.path / METRICS).open("a+b")
+        kept = self._cut_back(keep_bytes)
+        # The new file of events tells everything again, for TensorBoard would show both sides of a cut.
+        for earlier in run.path.glob("events.out.tfevents.*"):
+            earlier.unlink()
         # TensorBoard's own writer, without torch's wrapper: tabular runs need not wait for torch.
         self._events = EventFileWriter(str(run.path))
-        self._rows: dict[str, list[dict[str, float]]] = {}
+        for row in kept:
+            self._keep(row.pop("series"), row)
+
+    def _cut_back(self, length: int) -> list[dict[str, Any]]:
+        self._file.seek(0)
+        content = self._file.read(length)
+        if len(content) < length:
+            raise InputError(f"{METRICS} has {len(content)} bytes, its checkpoint needs {length}: rows are missing")
+        self._file.truncate(length)
+        self._file.seek(0, os.SEEK_END)
+        try:
+            return [json.loads(line) for line in content.decode("utf-8").splitlines()]
+        except ValueError:
+            raise InputError(f"{METRICS} is damaged: it holds lines that are no JSON") from None
 
     def add(self, series: str, steps: int, metrics: Mapping[str, float]) -> None:
         """Write one row, for example ``add("ppo", 16384, {"success_rate": 0.5})``."""
         row = {"steps": steps, **metrics}
         # JSON has no NaN: a rate that is not known yet is left out.
         finite = {name: value for name, value in row.items() if value == value}
-        self._rows.setdefault(series, []).append(finite)
-        self._file.write(json.dumps({"series": series, **finite}) + "\n")
+        self._file.write((json.dumps({"series": series, **finite}) + "\n").encode("utf-8"))
         self._file.flush()
-        values = [Summary.Value(tag=f"{series}/{n}", simple_value=v) for n, v in finite.items() if n != "steps"]
-        self._events.add_event(Event(wall_time=time.time(), step=steps, summary=Summary(value=values)))
+        self._keep(series, finite)
+
+    def _keep(self, series: str, row: dict[str, float]) -> None:
+        self._rows.setdefault(series, []).append(row)
+        values = [Summary.Value(tag=f"{series}/{n}", simple_value=v) for n, v in row.items() if n != "steps"]
+        event = Event(wall_time=time.time(), step=int(row["steps"]), summary=Summary(value=values))
+        self._events.add_event(event)
+
+    def sync(self) -> int:
+        """Force all rows to the disk; their length in bytes."""
+        os.fsync(self._file.fileno())
+        return self._file.tell()
 
     def curve(self, series: str, metric: str) -> tuple[list[float], list[float]]:
         """Steps and values of one metric, where it was measured."""
@@ -112,6 +194,17 @@ class MetricsLog:
     ) -> None:
         self._file.close()
         self._events.close()
+
+
+def _free_path(name: str) -> Path:
+    """``runs/<name>-<time>``, with a number where two runs start in one second."""
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    path = Path("runs") / f"{name}-{stamp}"
+    for count in range(2, 100):
+        if not path.exists():
+            break
+        path = Path("runs") / f"{name}-{stamp}-{count}"
+    return path
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

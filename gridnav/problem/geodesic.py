@@ -69,7 +69,9 @@ class Geodesic:
         self._in_sight, self._spans = _in_sight(layout, self._anchors)
         self._graph = self._visible_lengths(self._anchors)
         self._goals = np.empty((0, 2))
+        # Of each goal and anchor: length of the way, and the next anchor on it, their number for the goal itself.
         self._costs = np.empty((0, len(self._anchors)))
+        self._next = np.empty((0, len(self._anchors)), dtype=np.int32)
         self._number_of_cell = np.full(layout.walls.shape, -1)
 
     def goal_numbers(self, goals: IntArray) -> IntArray:
@@ -122,6 +124,31 @@ class Geodesic:
         """``distances`` for one point, shape ``(2,)``, and one goal cell; metres."""
         return float(self.distances(np.asarray(point_w)[None], np.array([self.goal_number(goal)]))[0])
 
+    def path(self, point_w: FloatArray, goal: Cell) -> FloatArray:
+        """The shortest way itself: straight from point to point, as long as ``distance`` says.
+
+        Args:
+            point_w: x and y in metres, world frame, outside the walls, shape ``(2,)``; more numbers do not matter.
+            goal: A free cell, (row, column).
+
+        Returns:
+            The point, the corners to be rounded (up to three points each) and the goal, metres, world frame, shape
+            ``(n, 2)``; empty where no way leads.
+        """
+        number, point_w = self.goal_number(goal), np.asarray(point_w, dtype=np.float64)[:2]
+        goal_w, walls, cell = self._goals[number], self.layout.walls, self.layout.cell_size_m
+        nodes, costs = np.concatenate([self._anchors, goal_w[None]]), np.append(self._costs[number], 0.0)
+        seen = _visible_from(point_w, nodes, walls, cell, _slim(point_w[0], point_w[1], walls, cell, self.radius_m))
+        totals = np.where(seen, np.hypot(*(nodes - point_w).T), np.inf) + costs
+        node = int(totals.argmin())
+        if np.isinf(totals[node]):
+            return np.empty((0, 2))
+        way = [point_w, nodes[node]]
+        while node < len(self._anchors):
+            node = int(self._next[number, node])
+            way.append(nodes[node])
+        return np.stack(way)
+
     def _add_goal(self, goal: Cell) -> None:
         goal_w = self.layout.to_metres(np.array(goal))
         nodes = np.concatenate([self._anchors, goal_w[None]])
@@ -132,10 +159,12 @@ class Geodesic:
         lengths[n, :n] = np.where(seen, np.hypot(*(self._anchors - nodes[n]).T), np.inf)
         lengths[:n, n] = lengths[n, :n]
         lengths[~np.isfinite(lengths)] = 0.0  # csgraph reads a zero of a dense matrix as "no edge"
-        costs = csgraph.dijkstra(csr_array(lengths), directed=False, indices=n)[:n]
+        # Searched from the goal: what comes before an anchor there comes after it on the way to the goal.
+        costs, following = csgraph.dijkstra(csr_array(lengths), directed=False, indices=n, return_predecessors=True)
         self._number_of_cell[goal] = len(self._goals)
         self._goals = np.concatenate([self._goals, goal_w[None]])
-        self._costs = np.concatenate([self._costs, costs[None]])
+        self._costs = np.concatenate([self._costs, costs[None, :n]])
+        self._next = np.concatenate([self._next, following[None, :n]])
 
     def _visible_lengths(self, anchors: FloatArray) -> FloatArray:
         """Lengths of the straight ways between anchors, shape ``(n, n)``, infinite where a wall is in the way."""
@@ -261,9 +290,7 @@ def _shortest(
     totals = np.empty(len(anchors) + 1)
     for i in range(len(points)):
         x, y = points[i, 0], points[i, 1]
-        # A robot nearer to a wall than its radius may keep its distance. And where it touches a corner, it sees the
-        # points around only through a sliver of the corner's arc.
-        slim = min(radius, clearance(x, y, walls, cell)[0] / ANCHOR_REACH)
+        slim = _slim(x, y, walls, cell, radius)
         goal = goals[goal_numbers[i]]
         cost = costs[goal_numbers[i]]
         col = min(max(int(np.floor(x / cell)), 0), n_cols - 1)
@@ -288,6 +315,14 @@ def _shortest(
                 out[i] = totals[k]
                 break
             totals[k] = np.inf
+
+
+@numba.njit(cache=True)
+def _slim(x: float, y: float, walls: BoolArray, cell: float, radius: float) -> float:
+    """Radius with which a disc at this point looks for its first corner, or the goal."""
+    # A robot nearer to a wall than its radius may keep its distance. And where it touches a corner, it sees the
+    # points around only through a sliver of the corner's arc.
+    return float(min(radius, clearance(x, y, walls, cell)[0] / ANCHOR_REACH))
 
 
 @numba.njit(cache=True)
