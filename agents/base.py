@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 
+from gridnav.problem.strict_json import read_object
 from gridnav.problem.types import NonFiniteError, State
 
 SUCCESS_WINDOW = 400
@@ -115,7 +116,8 @@ class Agent(ABC):
 def write_state(state: State, directory: Path, name: str) -> None:
     """Write ``name.safetensors`` and ``name.json`` into a directory that exists."""
     # Not `save_file`: a full disk is an OSError here.
-    content = save({key: np.ascontiguousarray(array) for key, array in state.arrays.items()})
+    # Not `ascontiguousarray`: it makes one number a list of one.
+    content = save({key: np.asarray(array, order="C") for key, array in state.arrays.items()})
     (directory / f"{name}.safetensors").write_bytes(content)
     (directory / f"{name}.json").write_text(json.dumps(state.values, allow_nan=False), encoding="utf-8")
 
@@ -130,10 +132,10 @@ def read_state(directory: Path, name: str) -> State:
         arrays = load_file(directory / f"{name}.safetensors")
     except SafetensorError as error:
         raise ValueError(f"{directory / name}.safetensors is damaged: {error}") from None
-    values = json.loads((directory / f"{name}.json").read_text(encoding="utf-8"))
-    if not isinstance(values, dict):
-        raise ValueError(f"{directory / name}.json must hold one JSON object")
-    return State(arrays, values)
+    try:
+        return State(arrays, read_object(directory / f"{name}.json"))
+    except ValueError as error:
+        raise ValueError(f"{directory / name}.json is damaged: {error}") from None
 
 
 def reached(next_observations: NDArray[Any], info: dict[str, Any]) -> NDArray[Any]:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any, Literal, NamedTuple, Self
 
@@ -200,7 +200,9 @@ class Replay:
 
     def __init__(self, n_rows: int, num_envs: int, observation_space: Discrete[Any] | Box) -> None:
         shape = n_rows, num_envs
-        self.observations: AnyArray = np.zeros((*shape, *observation_space.shape), dtype=_dtype(observation_space))
+        self.observations: AnyArray = np.zeros(
+            (*shape, *(observation_space.shape or ())), dtype=_dtype(observation_space)
+        )
         self.actions: IntArray = np.zeros(shape, dtype=np.int64)
         self.rewards: FloatArray = np.zeros(shape)
         self.reached: AnyArray = np.zeros_like(self.observations)
@@ -353,7 +355,8 @@ class Learner:
         moments: dict[int, dict[str, Tensor]] = {}
         for name, tensor in _below("optimizer", tensors).items():
             i, _, what = name.partition(".")
-            moments.setdefault(int(i), {})[what] = tensor
+            # Files make an array of one number out of a number without axes, which Adam's count of steps is.
+            moments.setdefault(int(i), {})[what] = tensor.reshape(()) if what == "step" else tensor
         self.optimizer.load_state_dict(self.optimizer.state_dict() | {"state": moments})
         self.n_updates = state.values["n_updates"]
 
@@ -376,13 +379,11 @@ class DQNAgent(Agent):
 
     def __init__(self, observation_space: gym.Space[Any], action_space: gym.Space[Any], config: DQNConfig) -> None:
         if not isinstance(action_space, Discrete) or action_space.start != 0:
-            raise ValueError(f"DQN needs a Discrete action space from 0, not {action_space}: take gridnav/GridWorld-v0")
-        if not (isinstance(observation_space, Discrete) and observation_space.start == 0) and not (
-            isinstance(observation_space, Box) and len(observation_space.shape) == 1
-        ):
-            raise ValueError(
-                f"DQN needs observations that are Discrete from 0 or a Box of one axis, not {observation_space}"
-            )
+            raise ValueError(f"DQN needs actions Discrete from 0, not {action_space}: take gridnav/GridWorld-v0")
+        numbered = isinstance(observation_space, Discrete) and observation_space.start == 0
+        if not numbered and not (isinstance(observation_space, Box) and len(observation_space.shape) == 1):
+            raise ValueError(f"DQN needs observations Discrete from 0 or a Box of one axis, not {observation_space}")
+        assert isinstance(observation_space, Discrete | Box)
         self.config = config
         self._observation_space, self._n_actions = observation_space, int(action_space.n)
         # Two threads on these small networks are slower than one, and the thread count is part of the seed.
@@ -398,9 +399,17 @@ class DQNAgent(Agent):
 
     def act(self, observations: NDArray[Any]) -> NDArray[Any]:
         """Greedy actions, shape ``(n,)``; ties go to the lower number."""
+        return self.action_values(observations).argmax(axis=1)
+
+    def values(self, observations: NDArray[Any]) -> NDArray[Any]:
+        """The values of the best actions, shape ``(n,)``."""
+        return self.action_values(observations).max(axis=1)
+
+    def action_values(self, observations: NDArray[Any]) -> NDArray[np.float32]:
+        """What the network expects of each action, shape ``(n, n_actions)``."""
         with torch.inference_mode():
             tensor = torch.from_numpy(np.asarray(observations, dtype=_dtype(self._observation_space)))
-            return self.network(tensor).argmax(dim=1).numpy()
+            return self.network(tensor).numpy()
 
     def learn(
         self,
@@ -491,11 +500,11 @@ class DQNAgent(Agent):
             if not np.isfinite(array).all():
                 raise ValueError(f"weights {name} must be finite numbers")
         sizes = values["observations"]
-        space = Discrete(sizes) if isinstance(sizes, int) else Box(-np.inf, np.inf, tuple(sizes))
+        space: gym.Space[Any] = Discrete(sizes) if isinstance(sizes, int) else Box(-np.inf, np.inf, tuple(sizes))
         config = DQNConfig(**{**values["config"], "hidden": tuple(values["config"]["hidden"])})
         agent = cls(space, Discrete(values["actions"]), config)
         try:
             agent.network.load_state_dict({name: torch.from_numpy(array) for name, array in state.arrays.items()})
         except RuntimeError as error:
-            raise ValueError(f"weights do not fit the network: {error}") from error
+            raise ValueError(f"weights do not fit the network: {' '.join(str(error).split())}") from error
         return agent

@@ -40,7 +40,7 @@ class PPOConfig:
 
     seed: int = 0
     """Of weights, exploration and batches."""
-    steps: int = 800_000
+    steps: int = 720_000
     """Environment steps of a training of the usual length."""
     num_envs: int = 256
     """Environments stepped together."""
@@ -50,7 +50,7 @@ class PPOConfig:
     """Transitions per gradient step."""
     n_epochs: int = 6
     """Passes over a rollout."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 3e-3
     """Adam's step size at the beginning; it falls linearly to a tenth over the planned steps."""
     gamma: float = 0.99
     """Discount per control period."""
@@ -60,7 +60,7 @@ class PPOConfig:
     """Weight of the entropy bonus."""
     log_std_init: float = -0.5
     """Logarithm of the policy's first standard deviation, as fraction of full speed."""
-    log_std_final: float = -1.5
+    log_std_final: float = -2.0
     """In the second half of the planned steps its upper bound falls linearly to this, so that what is trained is what
     acts greedily."""
     hidden: tuple[int, ...] = (64, 64)
@@ -327,7 +327,7 @@ class Sb3VecEnv(VecEnv):
 _NOTHING: dict[str, Any] = {}
 
 
-_REPORTED = ("train/approx_kl", "train/explained_variance", "train/std", "train/value_loss")
+_REPORTED = ("train/approx_kl", "train/explained_variance", "train/learning_rate", "train/std", "train/value_loss")
 """What stable-baselines3 logs of an update that goes into the metrics."""
 
 

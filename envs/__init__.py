@@ -8,6 +8,7 @@ from .gl import RenderingError
 from .gl import works as gl_works
 from .grid_moves import GridMoves, MoveDriver
 from .grid_world import GridWorldEnv, GridWorldVectorEnv
+from .layout_mix import LayoutMix
 from .lidar import Lidar, scan
 from .mjcf import build_spec
 from .navigation import NavigationVectorEnv
@@ -23,6 +24,7 @@ __all__ = [
     "GridMoves",
     "GridWorldEnv",
     "GridWorldVectorEnv",
+    "LayoutMix",
     "Lidar",
     "MoveDriver",
     "NavigationEnv",

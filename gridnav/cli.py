@@ -18,7 +18,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import tyro
 from rich.console import Console
@@ -27,6 +27,7 @@ from rich.table import Table
 
 from gridnav.agents import OnProgress
 from gridnav.agents import Progress as Learning
+from gridnav.display.figures import save_figure
 from gridnav.display.recording import ViewerError
 from gridnav.envs import RenderingError
 from gridnav.experiment.checkpoint import clear_leftovers
@@ -38,14 +39,17 @@ from gridnav.experiment.training import (
     BudgetName,
     Choice,
     OnStage,
-    Problem,
     Result,
     check_choice,
 )
+from gridnav.experiment.worlds import RANDOM, Problem
 from gridnav.problem.layout import NAMED_LAYOUTS, Layout
 from gridnav.problem.reward import Reward
 from gridnav.problem.task import Task
 from gridnav.problem.types import InputError, NonFiniteError
+
+if TYPE_CHECKING:
+    from gridnav.experiment.across_seeds import AcrossSeeds
 
 Config = TypeVar("Config")
 stderr = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -87,7 +91,7 @@ class _Run:
         if not 0 <= self.checkpoint_s <= 86_400:
             raise InputError(f"--checkpoint-s {self.checkpoint_s} is outside 0 to 86400 seconds")
         problem = Problem.load(self.layout, self.task, self.reward)
-        layout = self.layout if self.layout in NAMED_LAYOUTS else problem.layout.to_text()
+        layout = self.layout if self.layout in (*NAMED_LAYOUTS, RANDOM) else problem.layout.to_text()
         config = asdict(replace(self, layout=layout, **OF_ONE_START))
         config = {key: value for key, value in config.items() if key not in OF_ONE_START and value is not None}
         command = {kind: name for name, kind in COMMANDS.items()}[type(self)]
@@ -161,7 +165,7 @@ class Train(_Run):
         world = self.env.split("/")[1].removesuffix("-v0") if self.env else _home(self.agent)
         problem, config = self._problem()
         choice = Choice(self.preset, self._changes(), self.observation)
-        check_choice(kinds, world, choice)
+        check_choice(kinds, problem, world, choice)
         budget = BUDGETS[self.budget]
         with self._directory(f"train-{self.agent}", config) as run, _progress() as on_stage:
             results = train_and_report(
@@ -188,33 +192,49 @@ OF_ONE_START: dict[str, Any] = {"run_dir": None, "resume": False, "checkpoint_s"
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Evaluate the agents of a run again, on fixed seeds."""
+    """Evaluate the agents of one or several runs again, on fixed seeds; several seeds are put together."""
 
-    run: Annotated[Path, tyro.conf.Positional]
-    """A run directory."""
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Run directories."""
     episodes: int = 200
     """How many, for each agent."""
     seed: int | None = None
     """Of starts, goals and headings; that of every evaluation by default."""
     output: Path | None = None
     """A JSON file for all metrics and one row per episode."""
+    figure: Path | None = None
+    """A picture, .png or .svg, of the runs' learning curves with intervals over seeds."""
 
     def __call__(self) -> int:
         """Run it."""
+        from gridnav.experiment.across_seeds import across_seeds, compared_curves
         from gridnav.experiment.results import evaluate_again, evaluation
 
+        if not self.runs:
+            raise InputError("evaluate needs the folder of at least one run")
         if self.episodes < 1:
             raise InputError(f"--episodes {self.episodes} must be at least 1")
         if self.seed is not None and self.seed < 0:
             raise InputError(f"--seed {self.seed} must be at least 0")
-        if self.output is not None:
-            _check_folder("--output", self.output)
-        run = RunDirectory.open(self.run)
+        for flag, file in (("--output", self.output), ("--figure", self.figure)):
+            if file is not None:
+                _check_folder(flag, file)
+        if self.figure is not None and self.figure.suffix not in (".png", ".svg"):
+            raise InputError(f"--figure {str(self.figure)!r} must end with .png or .svg")
+        runs = [RunDirectory.open(path) for path in self.runs]
         with _progress() as on_stage:
-            results = evaluate_again(run, self.episodes, self.seed, on_stage)
+            results = [(run, evaluate_again(run, self.episodes, self.seed, on_stage)) for run in runs]
+        together = across_seeds(results) if len(runs) > 1 else []
         if self.output is not None:
-            write_json(self.output, {"results": evaluation(results)})
-        _show(results, None)
+            own = {str(run.path): evaluation(one) for run, one in results}
+            content: dict[str, Any] = {"results": next(iter(own.values()))} if len(own) == 1 else {"runs": own}
+            write_json(self.output, content | ({"across_seeds": [asdict(row) for row in together]} if together else {}))
+        if self.figure is not None:
+            save_figure(compared_curves(results), self.figure)
+        for run, one in results:
+            _show(one, None, title=str(run.path) if len(runs) > 1 else "")
+        if together:
+            _show_together(together)
         return 0
 
 
@@ -418,7 +438,7 @@ def _parse(config: Callable[..., Config], name: str, words: list[str]) -> Config
 
 
 def _with_config(name: str, words: list[str]) -> list[str]:
-    """The flags of ``--config FILE``, or of the run to resume, in front of the others, so that all are checked alike."""
+    """The flags of ``--config FILE``, or of the run to resume, in front of the others: all are checked alike."""
     words = [
         part
         for word in words
@@ -505,19 +525,55 @@ def _progress() -> Iterator[OnStage]:
         yield on_stage
 
 
-def _show(results: Sequence[Result], run: RunDirectory | None) -> None:
-    table = Table("rung", "world", "agent", "success (95 % interval)", "SPL", "SCT", "collided", "median time", "steps")
+def _show(results: Sequence[Result], run: RunDirectory | None, *, title: str = "") -> None:
+    table = Table(
+        "rung", "world", "agent", "success (95 % interval)", "SPL", "SCT", "collided", "median time", "steps",
+        title=title or None, title_justify="left",
+    )  # fmt: skip
     for result in results:
         summary = result.summary
-        low, high = summary.success_interval
-        time = "-" if summary.time_to_goal_s is None else f"{summary.time_to_goal_s:.1f} s"
-        success = f"{summary.success_rate:6.1%} ({low:.1%} to {high:.1%})"
+        time = "-" if summary.median_time_s is None else f"{summary.median_time_s:.1f} s"
+        success = _share(summary.success_rate, summary.success_interval)
         ratios = f"{summary.spl:.2f}", f"{summary.sct:.2f}", f"{summary.collision_rate:.1%}"
         table.add_row(result.name, result.world, result.agent, success, *ratios, time, f"{result.steps:,}")
     stdout.print(table)
+    for result in results:
+        for note in _notes(result):
+            stdout.print(f"{result.name}: {note}")
     if run is not None:
         stdout.print(f"report     {run.report}")
         stdout.print(f"recording  {run.recording}   (gridnav view {shlex.quote(str(run.path))})")
+
+
+def _notes(result: Result) -> Iterator[str]:
+    """What a reader of the numbers should know beside them."""
+    summary = result.summary
+    if summary.layouts > 1:
+        yield f"{summary.layouts} held-out layouts, success in the worst tenth of them {summary.success_cvar:.1%}"
+    for behaviour, share in summary.behaviours.items():
+        if share > 0:
+            yield f"{behaviour} in {share:.1%} of the episodes"
+    if summary.physics_errors:
+        yield f"diverged physics ended {summary.physics_errors} episodes"
+
+
+def _show_together(rows: Sequence[AcrossSeeds]) -> None:
+    table = Table(
+        "agent", "world", "solved", "success (95 % interval)", "worst", "SPL", "SCT", "collided", "training",
+        title="over seeds: interquartile means with 95 % bootstrap intervals; solved: success of at least 99 %",
+        title_justify="left",
+    )  # fmt: skip
+    for row in rows:
+        table.add_row(
+            row.name, row.world, f"{row.n_solved} of {len(row.seeds)}", _share(row.success, row.success_interval),
+            f"{row.success_range[0]:.1%}", f"{row.spl:.2f}", f"{row.sct:.2f}",
+            _share(row.collision_rate, row.collision_rate_interval), f"{row.training_seconds:.1f} s",
+        )  # fmt: skip
+    stdout.print(table)
+
+
+def _share(value: float, interval: tuple[float, float]) -> str:
+    return f"{value:6.1%} ({interval[0]:.1%} to {interval[1]:.1%})"
 
 
 if __name__ == "__main__":

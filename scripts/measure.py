@@ -20,7 +20,8 @@ from gridnav.agents import Planner, QLearning, QLearningConfig
 from gridnav.experiment.evaluation import evaluate, policy_for
 from gridnav.experiment.ladder import steps_to
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
-from gridnav.experiment.training import BUDGETS, Problem, Workshop
+from gridnav.experiment.training import BUDGETS, Workshop
+from gridnav.experiment.worlds import Problem
 from gridnav.problem.metrics import summarise
 
 PROBLEM = Problem.load("classic", "default", "default")

@@ -25,7 +25,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from gridnav.agents import PPOAgent, PPOConfig
 from gridnav.envs import NavigationVectorEnv
-from gridnav.experiment.training import Problem
+from gridnav.experiment.worlds import Problem
 
 # What is timed: the name in the table, its owner, and the method.
 TIMED: list[tuple[str, Any, str]] = [

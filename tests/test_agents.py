@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from gridnav import Layout, Reward, Task
-from gridnav.agents import Agent, Planner, Progress, QLearning, QLearningConfig
+from gridnav.agents import Planner, Progress, QLearning, QLearningConfig
 from gridnav.envs import GridWorldVectorEnv
 from gridnav.problem.geodesic import cell_distances
 from gridnav.problem.grid_mdp import GridMDP, MoveTable
@@ -247,7 +247,7 @@ def test_tables_come_back_bit_by_bit(tmp_path: Path) -> None:
         loaded = type(agent).load(directory)
 
         assert loaded.action_values.tobytes() == table.tobytes()
-        assert {path.name for path in directory.iterdir()} == {"weights.safetensors", "agent.json"} == set(Agent.files)
+        assert {path.name for path in directory.iterdir()} == {"agent.safetensors", "agent.json"}
     assert QLearning.load(tmp_path / "q-learning").config == learner.config
 
 
@@ -295,7 +295,7 @@ def ppo(seed: int = 0, *, env: VectorEnv[Any, Any, Any] | None = None, **changes
 
 def weights(agent: Any) -> dict[str, bytes]:
     """All weights as bytes."""
-    return {name: array.tobytes() for name, array in agent.state()[0].items()}
+    return {name: array.tobytes() for name, array in agent.state().arrays.items()}
 
 
 def test_ppo_learns_where_to_reach() -> None:
@@ -358,7 +358,7 @@ def test_ppo_comes_back_from_its_files_unchanged(tmp_path: Path) -> None:
     assert loaded.act(x).tobytes() == agent.act(x).tobytes()
     assert weights(loaded) == weights(agent)
     assert loaded.config == agent.config
-    assert {path.name for path in tmp_path.iterdir()} == {"weights.safetensors", "agent.json"}
+    assert {path.name for path in tmp_path.iterdir()} == {"agent.safetensors", "agent.json"}
     assert json.loads((tmp_path / "agent.json").read_text())["kind"] == "ppo"
     with pytest.raises(ValueError, match="kind 'ppo', not 'plan'"):
         Planner.load(tmp_path)
@@ -459,4 +459,17 @@ def test_the_success_rate_is_not_known_before_every_environment_has_ended_an_epi
 
     window.add({})
     window.add({"final_info": ended, "_final_info": np.array([False, True])})
-    assert window.metrics == {"success_rate": 0.5, "collision_rate": 0.5, "episodes": 2.0}
+    assert window.metrics == {"success_rate": 0.5, "collision_rate": 0.5, "episodes": 2.0, "physics_errors": 0.0}
+
+
+def test_diverged_physics_is_counted_and_part_of_the_windows_state() -> None:
+    window = EpisodeWindow()
+    ended = {"is_success": np.zeros(3, bool), "collisions": np.zeros(3), "physics_error": np.array([True, False, True])}
+
+    # By hand: the third robot's physics diverged too, but its episode is not among those that ended.
+    window.add({"final_info": ended, "_final_info": np.array([True, True, False])})
+
+    assert window.metrics["physics_errors"] == 1.0
+    assert window.metrics["episodes"] == 2.0
+    again = EpisodeWindow.from_state(json.loads(json.dumps(window.state())))
+    assert again.state() == window.state()

@@ -47,13 +47,16 @@ def test_a_checkpoint_is_a_directory_with_a_hash_of_each_part(tmp_path: Path) ->
     checkpoint = save_agent(planner(1.0), tmp_path / "run" / "checkpoints", 12345, name="plan")
 
     assert checkpoint == tmp_path / "run" / "checkpoints" / "step-000000012345"
-    assert {part.name for part in checkpoint.iterdir()} == {"manifest.json", "weights.safetensors", "agent.json"}
+    assert {part.name for part in checkpoint.iterdir()} == {"manifest.json", "agent.safetensors", "agent.json"}
     manifest = json.loads((checkpoint / "manifest.json").read_text())
-    assert (manifest["format"], manifest["name"], manifest["kind"], manifest["step"]) == (1, "plan", "plan", 12345)
+    assert (manifest["format"], manifest["name"], manifest["kind"], manifest["step"]) == (2, "plan", "plan", 12345)
     assert manifest["parts"] == {
-        name: digest((checkpoint / name).read_bytes()) for name in ("weights.safetensors", "agent.json")
+        name: digest((checkpoint / name).read_bytes()) for name in ("agent.safetensors", "agent.json")
     }
     assert manifest["versions"].keys() >= {"gridnav", "numpy", "torch", "mujoco"}
+    assert manifest["standing"] == {
+        "steps": 12345, "seconds": 0.0, "run_steps": 12345, "log_bytes": 0, "is_finished": True,
+    }  # fmt: skip
 
 
 def test_nothing_in_a_checkpoint_is_a_pickle(tmp_path: Path) -> None:
@@ -82,7 +85,7 @@ def test_the_newest_of_each_name_is_read(tmp_path: Path) -> None:
 
     assert loaded_value(tmp_path, "plan") == 10.0
     assert loaded_value(tmp_path, "other") == 2.0
-    with pytest.raises(InputError, match="no whole checkpoint of 'third'"):
+    with pytest.raises(InputError, match="no checkpoint of 'third'"):
         load_agent(tmp_path, "third")
 
 
@@ -138,21 +141,21 @@ def flip(path: Path) -> None:
 
 
 DAMAGES: dict[str, Callable[[Path], object]] = {
-    "weights cut short": lambda c: truncate(c / "weights.safetensors"),
-    "one bit of the weights": lambda c: flip(c / "weights.safetensors"),
+    "weights cut short": lambda c: truncate(c / "agent.safetensors"),
+    "one bit of the weights": lambda c: flip(c / "agent.safetensors"),
     "one bit of the agent": lambda c: flip(c / "agent.json"),
-    "no weights": lambda c: (c / "weights.safetensors").unlink(),
+    "no weights": lambda c: (c / "agent.safetensors").unlink(),
     "no manifest": lambda c: (c / "manifest.json").unlink(),
     "manifest cut short": lambda c: truncate(c / "manifest.json"),
     "empty manifest": lambda c: (c / "manifest.json").write_bytes(b""),
     "binary manifest": lambda c: (c / "manifest.json").write_bytes(bytes(range(128, 256))),
     "manifest of another shape": lambda c: (c / "manifest.json").write_text("[1, 2]"),
     "bottomless manifest": lambda c: (c / "manifest.json").write_text("[" * 100_000),
-    "another format": lambda c: edit_manifest(c, lambda m: m.update(format=2)),
+    "another format": lambda c: edit_manifest(c, lambda m: m.update(format=1)),
     "no name": lambda c: edit_manifest(c, lambda m: m.pop("name")),
     "no kind": lambda c: edit_manifest(c, lambda m: m.pop("kind")),
     "no parts": lambda c: edit_manifest(c, lambda m: m.update(parts={})),
-    "parts of another shape": lambda c: edit_manifest(c, lambda m: m.update(parts=["weights.safetensors"])),
+    "parts of another shape": lambda c: edit_manifest(c, lambda m: m.update(parts=["agent.safetensors"])),
     "another hash": lambda c: edit_manifest(c, lambda m: m["parts"]["agent.json"].update(sha256="0" * 64)),
     "another size": lambda c: edit_manifest(c, lambda m: m["parts"]["agent.json"].update(bytes=1)),
     "a part that is not there": lambda c: edit_manifest(c, lambda m: m["parts"].update(more=digest(b""))),
@@ -194,7 +197,7 @@ def test_what_a_killed_run_leaves_behind_is_not_read(tmp_path: Path) -> None:
 def test_no_checkpoint_at_all_is_said_in_one_line(tmp_path: Path, missing: bool) -> None:
     directory = tmp_path / "none" if missing else tmp_path
 
-    with pytest.raises(InputError, match="holds no whole checkpoint of 'plan'") as caught:
+    with pytest.raises(InputError, match="holds no checkpoint of 'plan'") as caught:
         load_agent(directory, "plan")
 
     assert str(caught.value).isprintable()

@@ -12,12 +12,12 @@ from gridnav.experiment.evaluation import evaluate, make_worlds, policy_for
 from gridnav.experiment.ladder import climb
 from gridnav.experiment.robot_lint import lint_robot
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
-from gridnav.experiment.training import Budget, Problem
+from gridnav.experiment.training import CHECKPOINT_S, Budget, Problem
 from gridnav.problem.layout import Layout
 from gridnav.problem.metrics import summarise
 from gridnav.problem.reward import Reward, Transition
 from gridnav.problem.task import Task
-from gridnav.problem.types import FloatArray
+from gridnav.problem.types import FloatArray, InputError
 
 PROBLEM = Problem.load("classic", "default", "default")
 
@@ -92,10 +92,11 @@ def test_a_reward_that_pays_for_spinning_is_found_out() -> None:
 
 
 def test_the_ladder_climbs_and_writes_everything(tmp_path: Path) -> None:
-    run = RunDirectory.create(tmp_path / "run", "ladder", {"command": "ladder"})
-    budget = Budget(q_learning_visits=150, ppo_steps=4096, episodes=4)
+    # By hand: 4,096 of PPO's 800,000 steps, one rollout.
+    budget = Budget(share=4_096 / 800_000, episodes=4)
 
-    results = climb(PROBLEM, budget, 0, run, "gridnav ladder", {"seed": 0}, quiet)
+    with RunDirectory.create(tmp_path / "run", "ladder", {"command": "ladder"}) as run:
+        results = climb(PROBLEM, budget, 0, run, "gridnav ladder", {"seed": 0}, quiet, checkpoint_s=CHECKPOINT_S)
 
     by_name = {result.name: result.summary.success_rate for result in results}
     assert list(by_name)[:4] == ["plan", "q-learning", "q-table-unicycle", "q-table-diffdrive"]
@@ -111,9 +112,8 @@ def test_the_ladder_climbs_and_writes_everything(tmp_path: Path) -> None:
 
 
 def test_metrics_go_to_both_files_and_leave_out_what_is_not_a_number(tmp_path: Path) -> None:
-    run = RunDirectory.create(tmp_path / "run", "train", {})
-    with MetricsLog(run) as log:
-        log.add("ppo", 10, {"success_rate": float("nan"), "episodes": 0.0})
+    with RunDirectory.create(tmp_path / "run", "train", {}) as run, MetricsLog(run) as log:
+        log.add("ppo", 10, {"success_rate": float("nan"), "episodes": 0.0, "loss": float("inf")})
         log.add("ppo", 20, {"success_rate": 0.5, "episodes": 2.0})
         assert log.curve("ppo", "success_rate") == ([20], [0.5])
 
@@ -124,3 +124,35 @@ def test_metrics_go_to_both_files_and_leave_out_what_is_not_a_number(tmp_path: P
     ]
     (events,) = run.path.glob("events.out.tfevents.*")
     assert b"ppo/success_rate" in events.read_bytes()
+
+
+def test_continued_metrics_are_cut_back_and_told_again_to_tensorboard(tmp_path: Path) -> None:
+    with RunDirectory.create(tmp_path / "run", "train", {}) as run:
+        with MetricsLog(run) as log:
+            log.add("ppo", 10, {"success_rate": 0.25})
+            kept = log.sync()
+            log.add("ppo", 20, {"lost": 0.5})
+        with MetricsLog(run, kept) as log:
+            assert log.curve("ppo", "success_rate") == ([10], [0.25])
+            log.add("ppo", 20, {"success_rate": 0.75})
+
+    rows = [json.loads(line) for line in (run.path / "metrics.jsonl").read_text().splitlines()]
+    assert rows == [
+        {"series": "ppo", "steps": 10, "success_rate": 0.25},
+        {"series": "ppo", "steps": 20, "success_rate": 0.75},
+    ]
+    (events,) = run.path.glob("events.out.tfevents.*")
+    assert events.read_bytes().count(b"ppo/success_rate") == 2
+    assert b"ppo/lost" not in events.read_bytes()
+
+
+@pytest.mark.parametrize("content", [b"", b'{"series": "a", "steps": 1}', b"[1]\n" * 9, b"x" * 36, b"[" * 36])
+def test_metrics_that_do_not_fit_the_checkpoint_are_refused_and_left_as_they_are(
+    tmp_path: Path, content: bytes
+) -> None:
+    with RunDirectory.create(tmp_path / "run", "train", {}) as run:
+        (run.path / "metrics.jsonl").write_bytes(content + b"more than that")
+        with pytest.raises(InputError, match=r"metrics\.jsonl"):
+            MetricsLog(run, 36 if len(content) == 36 else 60)
+
+    assert (run.path / "metrics.jsonl").read_bytes() == content + b"more than that"

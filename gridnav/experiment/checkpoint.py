@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from gridnav.agents import Agent, Planner, QLearning, read_state, write_state
+from gridnav.problem.strict_json import read_object
 from gridnav.problem.types import InputError, IntArray, State
 
 FORMAT = 2
@@ -45,6 +46,15 @@ class Standing:
     """Length of the run's metrics, which a continued run cuts back to."""
     is_finished: bool = False
     """This agent's training is over."""
+
+    def __post_init__(self) -> None:
+        counts = self.steps, self.run_steps, self.log_bytes
+        if not all(type(count) is int and 0 <= count < 2**53 for count in counts):
+            raise ValueError(f"steps and bytes of {self} must be whole numbers of at least 0")
+        if not isinstance(self.seconds, int | float) or not 0 <= self.seconds < 1e300:
+            raise ValueError(f"seconds {self.seconds!r:.60} must be a number of at least 0")
+        if not isinstance(self.is_finished, bool):
+            raise ValueError(f"is_finished {self.is_finished!r:.60} must be true or false")
 
 
 @dataclass(frozen=True)
@@ -89,7 +99,10 @@ def save_checkpoint(directory: Path, name: str, checkpoint: Checkpoint) -> Path:
         raise
     _sync(directory)
     for old in _whole(directory, name)[KEPT:]:
-        shutil.rmtree(old)
+        # Out of sight first: killed in the middle, half a checkpoint would look like a damaged one.
+        aside = directory / f".tmp-{uuid.uuid4().hex}"
+        old.rename(aside)
+        shutil.rmtree(aside)
     return final
 
 
@@ -122,10 +135,10 @@ def _write(aside: Path, name: str, checkpoint: Checkpoint) -> None:
 
 
 def _fresh(directory: Path, step: int) -> Path:
-    """The checkpoint's name, or the next free one: nothing that was saved is ever overwritten."""
-    while (final := directory / f"step-{step:012d}").exists():
-        step += 1
-    return final
+    """The checkpoint's name, or the next higher one that is free: what is newer never has a lower number."""
+    numbers = [path.name.removeprefix("step-") for path in directory.glob("step-*")]
+    last = max((int(number) for number in numbers if len(number) == 12 and number.isdecimal()), default=-1)
+    return directory / f"step-{max(step, last + 1):012d}"
 
 
 def load_checkpoint(directory: Path, name: str) -> Checkpoint | None:
@@ -142,13 +155,14 @@ def load_checkpoint(directory: Path, name: str) -> Checkpoint | None:
     """
     faults: list[str] = []
     for path in _newest_first(directory):
+        if not _may_be_of(path, name):
+            continue
         fault = _fault(path)
-        if not fault and _manifest(path)["name"] == name:
+        if not fault:
             if faults:
                 log.warning("passed over damaged checkpoints, going back to %s: %s", path.name, faults[0])
             return _load(path)
-        if fault:
-            faults.append(fault)
+        faults.append(fault)
     if faults:
         raise InputError(f"{str(directory)!r} holds no whole checkpoint of {name!r}: {faults[0]}")
     return None
@@ -164,7 +178,7 @@ def _load(path: Path) -> Checkpoint:
         )
         standing = Standing(**manifest["standing"])
         return Checkpoint(agent, standing, training, worlds, visits.arrays["visits"] if visits else None)
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise InputError(f"checkpoint {str(path)!r} cannot be used: {error}") from error
 
 
@@ -181,10 +195,19 @@ def load_agent(directory: Path, name: str) -> Agent:
 
 
 def last_standing(directory: Path) -> Standing:
-    """Where a run stood in its newest whole checkpoint, of whichever agent; at its beginning without one."""
+    """Where a run stood in its newest whole checkpoint, of whichever agent; at its beginning without any.
+
+    Raises:
+        InputError: When there are checkpoints and none is whole.
+    """
+    faults = []
     for path in _newest_first(directory):
-        if not _fault(path):
+        fault = _fault(path)
+        if not fault:
             return Standing(**_manifest(path)["standing"])
+        faults.append(fault)
+    if faults:
+        raise InputError(f"{str(directory)!r} holds no whole checkpoint: {faults[0]}")
     return Standing()
 
 
@@ -200,19 +223,19 @@ def _newest_first(directory: Path) -> list[Path]:
 
 def _whole(directory: Path, name: str) -> list[Path]:
     """Whole checkpoints of one agent, newest first."""
-    return [path for path in _newest_first(directory) if _is_of(path, name) and not _fault(path)]
+    return [path for path in _newest_first(directory) if _may_be_of(path, name) and not _fault(path)]
 
 
-def _is_of(checkpoint: Path, name: str) -> bool:
+def _may_be_of(checkpoint: Path, name: str) -> bool:
+    """Whether it is one of that agent's, or so damaged that one cannot tell."""
     try:
         return bool(_manifest(checkpoint)["name"] == name)
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return False
+    except (OSError, ValueError, KeyError):
+        return True
 
 
 def _manifest(checkpoint: Path) -> dict[str, Any]:
-    manifest: dict[str, Any] = json.loads((checkpoint / MANIFEST).read_text(encoding="utf-8"))
-    return manifest
+    return read_object(checkpoint / MANIFEST)
 
 
 def _agent_class(kind: str) -> type[Agent]:
@@ -242,6 +265,8 @@ def _fault(checkpoint: Path) -> str:
         if not {"agent.safetensors", "agent.json"} <= parts.keys():
             return f"{checkpoint.name}/{MANIFEST} names no agent"
         Standing(**manifest["standing"])
+        if (checkpoint / MANIFEST).is_symlink() or any(_partner(part) not in parts for part in parts):
+            return f"{checkpoint.name}/{MANIFEST} is damaged"
         for part, expected in parts.items():
             # Names come from a file: only plain ones inside the checkpoint are looked at.
             if part != Path(part).name or (checkpoint / part).is_symlink():
@@ -251,8 +276,14 @@ def _fault(checkpoint: Path) -> str:
             if (checkpoint / part).stat().st_size > LARGEST or _digest(checkpoint / part) != expected:
                 return f"{checkpoint.name}/{part} is damaged: its SHA-256 is not that of {MANIFEST}"
         return ""
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return f"{checkpoint.name}/{MANIFEST} is missing or damaged"
+
+
+def _partner(part: str) -> str:
+    """Each part is a pair of files."""
+    stem, _, suffix = part.rpartition(".")
+    return f"{stem}.{ {'json': 'safetensors', 'safetensors': 'json'}.get(suffix, '') }"
 
 
 def _digest(part: Path) -> dict[str, object]:

@@ -6,13 +6,13 @@ from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 
 from gridnav.agents import Agent, OnProgress, Progress, TabularAgent
 from gridnav.envs import Lidar, MoveDriver, NavigationVectorEnv
+from gridnav.experiment.worlds import Problem
 from gridnav.problem.behaviour import diagnose
 from gridnav.problem.geodesic import Geodesic
 from gridnav.problem.metrics import Episode, Trace, driving_time, measure_motion
@@ -21,15 +21,11 @@ from gridnav.problem.types import AnyArray, Cell
 EVALUATION_SEED = 1_000_000
 """Seed of the evaluation episodes; no training uses it."""
 
+HELD_OUT_LAYOUTS = 100
+"""Layouts of an evaluation in a family of layouts, if there are episodes enough."""
+
 Policy = Callable[[NDArray[Any]], NDArray[Any]]
 """Observations of all environments to their actions, a leading batch axis on both."""
-
-
-def make_worlds(world: str, num_envs: int, **options: Any) -> NavigationVectorEnv:
-    """The vector form of ``GridWorld``, ``Unicycle`` or ``DiffDrive``, with its usual time limit."""
-    worlds = gym.make_vec(f"gridnav/{world}-v0", num_envs=num_envs, **options)
-    assert isinstance(worlds, NavigationVectorEnv)
-    return worlds
 
 
 def policy_for(agent: Agent, worlds: NavigationVectorEnv) -> Policy:
@@ -109,6 +105,42 @@ def evaluate(
     return course.episodes(last)
 
 
+def evaluate_in(
+    problem: Problem,
+    agent: Agent,
+    world: str,
+    n_episodes: int,
+    *,
+    observation: str = "cell_goal",
+    seed: int = EVALUATION_SEED,
+    on_progress: OnProgress | None = None,
+) -> list[Episode]:
+    """Fixed-seed episodes of an agent in a world, in as many held-out layouts as there can be where there is a family.
+
+    Args:
+        problem: What is to be solved.
+        agent: Who acts; an agent of the grid drives robots by grid moves.
+        world: Where.
+        n_episodes: How many; with held-out layouts, rounded down to a multiple of those.
+        observation: What an agent of the grid sees.
+        seed: Of starts, goals and headings.
+        on_progress: Told how many episodes have ended.
+    """
+    n_layouts = min(n_episodes, HELD_OUT_LAYOUTS) if problem.family else 1
+    layouts = problem.family.held_out(n_layouts) if problem.family else [problem.layout]
+    per_layout = n_episodes // n_layouts
+    episodes: list[Episode] = []
+    for number, layout in enumerate(layouts):
+        worlds = problem.worlds(world, per_layout, observation=observation, layout=layout)
+        inner = on_progress if n_layouts == 1 else None
+        episodes += evaluate(policy_for(agent, worlds), worlds, seed=seed + number, on_progress=inner)
+        worlds.close()
+        if on_progress and n_layouts > 1:
+            success = float(np.mean([episode.is_success for episode in episodes]))
+            on_progress(Progress(len(episodes), n_layouts * per_layout, {"success_rate": success}))
+    return episodes
+
+
 class _Course:
     """What a batch of environments went through, until each one's first episode is cut out of it."""
 
@@ -178,6 +210,7 @@ class _Course:
             goal_radius_m=0.0 if self._on_grid else self._worlds.task.goal_radius_m,
             motion=measure_motion(trace, layout, robot),
             behaviours=diagnose(trace, goal_w=layout.to_metres(np.array(goal)), layout=layout, robot=robot),
+            layout=layout.name,
         )
 
     def _shortest_time(self, shortest_path_m: float, goal: Cell, trace: Trace) -> float:

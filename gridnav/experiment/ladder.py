@@ -14,7 +14,8 @@ from gridnav.experiment.results import (
     write_rollout,
 )
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
-from gridnav.experiment.training import Budget, OnStage, Problem, Result, Trained, Workshop
+from gridnav.experiment.training import Budget, OnStage, Result, Trained, Workshop
+from gridnav.experiment.worlds import Problem
 
 QUESTION = (
     "How far does a table learnt on the grid carry a wheeled robot, and what does a network save that "

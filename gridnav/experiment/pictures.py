@@ -23,7 +23,8 @@ from gridnav.display.figures import (
 from gridnav.display.report import Picture
 from gridnav.envs import NavigationVectorEnv
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
-from gridnav.experiment.training import Problem, Result, Trained, grid_options
+from gridnav.experiment.training import Result, Trained
+from gridnav.experiment.worlds import Problem
 from gridnav.problem.geodesic import cell_distances
 from gridnav.problem.layout import Layout
 from gridnav.problem.types import Cell, FloatArray
@@ -78,8 +79,13 @@ def _drawn(
     if len(results) > 1:
         rows = {r.name: (r.summary.success_rate, *r.summary.success_interval) for r in results}
         yield "success", Picture(success_bars(rows), "Success in evaluation, with 95 % Wilson intervals.")
-    drawn = {f"{result.agent} on {result.world}": result.episodes[:DRAWN_EPISODES] for result in results}
-    words = f"The ways of the first {min(DRAWN_EPISODES, len(results[0].episodes))} evaluation episodes, the same "
+    here = {
+        f"{result.agent} on {result.world}": [e for e in result.episodes if e.layout == layout.name]
+        for result in results
+    }
+    drawn = {name: episodes[:DRAWN_EPISODES] for name, episodes in here.items()}
+    n_drawn = max(len(episodes) for episodes in drawn.values())
+    words = f"The ways of the first {n_drawn} evaluation episodes on {layout.name}, the same "
     yield "trajectories", Picture(trajectories(layout, drawn), words + "starts and goals in every panel.")
     for one in trained:
         suffix = f"-{one.name}" if len(trained) > 1 else ""
@@ -87,8 +93,8 @@ def _drawn(
         if one.visits is not None:
             words = f"Where {one.name} was in training, looked at each time it could have been cut."
             yield f"visits{suffix}", Picture(visit_counts(layout, one.visits), words)
-    told = results[-1]
-    episode = next((one for one in told.episodes if one.is_success), told.episodes[0])
+    told, candidates = results[-1], list(here.values())[-1]
+    episode = next((one for one in candidates if one.is_success), candidates[0])
     words = f"One evaluation episode of {told.agent} on {told.world}, step by step."
     yield "episode", Picture(episode_strip(layout, episode), words)
     yield "reward", Picture(reward_terms(episode), "What each term of the reward came to in that episode.")
@@ -98,7 +104,7 @@ def _values(problem: Problem, trained: Trained) -> Picture:
     """What an agent makes of the maze, for the last goal of the task."""
     layout, goals = problem.layout, problem.task.goal_cells(problem.layout)
     goal = (int(goals[-1, 0]), int(goals[-1, 1]))
-    worlds = problem.worlds(trained.world, 1, **grid_options(trained.world, trained.observation))
+    worlds = problem.worlds(trained.world, 1, observation=trained.observation)
     try:
         if isinstance(worlds.single_action_space, Discrete):
             moves = _move_values(trained.agent, worlds, layout, len(goals), goal, trained.observation)
@@ -115,8 +121,8 @@ def _values(problem: Problem, trained: Trained) -> Picture:
         label="value (discounted reward)", arrow_label="where it drives from its best heading",
     )  # fmt: skip
     words = (
-        f"What {trained.name}'s value network expects in each cell at rest, mean of {N_HEADINGS} headings, for the goal "
-        f"at cell {goal}, and the way its command takes it in a second."
+        f"What {trained.name}'s value network expects in each cell at rest, mean of {N_HEADINGS} headings, for the "
+        f"goal at cell {goal}, and the way its command takes it in a second."
     )
     return Picture(figure, words)
 

@@ -12,10 +12,12 @@ import numpy as np
 from gridnav.display.recording import write_recording
 from gridnav.display.report import Picture, Report, Rung, write_report
 from gridnav.experiment.checkpoint import LIBRARIES, last_standing, load_agent
-from gridnav.experiment.evaluation import EVALUATION_SEED, evaluate, policy_for
+from gridnav.experiment.evaluation import EVALUATION_SEED, evaluate_in
 from gridnav.experiment.pictures import pictures
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory, read_json, write_json
-from gridnav.experiment.training import AgentKind, Budget, Choice, OnStage, Problem, Result, Workshop, grid_options
+from gridnav.experiment.training import AgentKind, Budget, Choice, OnStage, Result, Workshop
+from gridnav.experiment.worlds import Problem
+from gridnav.problem.metrics import Episode
 from gridnav.problem.types import InputError
 
 _NEEDED = ("world", "agent", "carried", "checkpoint", "observation")
@@ -48,11 +50,16 @@ def write_rollout(
     run: RunDirectory, problem: Problem, results: Sequence[Result], properties: Mapping[str, Any]
 ) -> None:
     """``rollout.rrd``: the same episode of each result side by side, one that all of them finish if there is one."""
-    finished = np.all([[episode.is_success for episode in result.episodes] for result in results], axis=0)
+    finished = np.all([[episode.is_success for episode in _here(problem, result)] for result in results], axis=0)
     # argmax of all False is 0: then the first episode shows who fails.
     number = int(finished.argmax())
-    rollouts = {f"{result.agent} on {result.world}": result.episodes[number] for result in results}
+    rollouts = {f"{result.agent} on {result.world}": _here(problem, result)[number] for result in results}
     write_recording(run.recording, problem.layout, rollouts, title=f"gridnav {run.path.name}", properties=properties)
+
+
+def _here(problem: Problem, result: Result) -> list[Episode]:
+    """The episodes in the problem's own layout: all of them, unless there is a family of layouts."""
+    return [episode for episode in result.episodes if episode.layout == problem.layout.name]
 
 
 def report_rows(results: Sequence[Result], seed: int) -> list[Rung]:
@@ -181,11 +188,10 @@ def evaluate_again(run: RunDirectory, episodes: int, seed: int | None, on_stage:
     results = []
     for name, row in rows.items():
         agent = load_agent(run.checkpoints, row["checkpoint"])
-        worlds = problem.worlds(row["world"], episodes, **grid_options(row["world"], row["observation"]))
-        report = on_stage(f"evaluating {name}")
-        records = evaluate(
-            policy_for(agent, worlds), worlds, seed=EVALUATION_SEED if seed is None else seed, on_progress=report
-        )
-        worlds.close()
+        records = evaluate_in(
+            problem, agent, row["world"], episodes,
+            observation=row["observation"], seed=EVALUATION_SEED if seed is None else seed,
+            on_progress=on_stage(f"evaluating {name}"),
+        )  # fmt: skip
         results.append(Result(name, episodes=records, **row))
     return results

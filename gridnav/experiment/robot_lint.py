@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from gridnav.agents import Planner
 from gridnav.envs import NavigationVectorEnv
-from gridnav.experiment.evaluation import EVALUATION_SEED, Policy, drive_by_moves, make_worlds
+from gridnav.experiment.evaluation import EVALUATION_SEED, Policy, drive_by_moves
+from gridnav.experiment.worlds import make_worlds
 from gridnav.problem.layout import Layout
 from gridnav.problem.lint import Finding
 from gridnav.problem.reward import Reward

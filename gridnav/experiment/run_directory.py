@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import socket
 import time
@@ -17,6 +18,7 @@ from tensorboard.compat.proto.event_pb2 import Event
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
+from gridnav.problem.strict_json import parse_object, read_object
 from gridnav.problem.types import InputError
 
 CONFIG, METRICS, EVALUATION, REPORT, RECORDING = (
@@ -134,7 +136,7 @@ class MetricsLog:
         keep_bytes: Length of what a continued run keeps of its metrics; later rows will be written again.
 
     Raises:
-        InputError: When there is less than that to keep.
+        InputError: When there is less than that to keep, or it is damaged; nothing has changed then.
     """
 
     def __init__(self, run: RunDirectory, keep_bytes: int = 0) -> None:
@@ -150,22 +152,20 @@ class MetricsLog:
             self._keep(row.pop("series"), row)
 
     def _cut_back(self, length: int) -> list[dict[str, Any]]:
+        there = self._file.seek(0, os.SEEK_END)
+        if there < length:
+            raise InputError(f"{METRICS} has {there} bytes, its checkpoint needs {length}: rows are missing")
         self._file.seek(0)
-        content = self._file.read(length)
-        if len(content) < length:
-            raise InputError(f"{METRICS} has {len(content)} bytes, its checkpoint needs {length}: rows are missing")
+        rows = _rows(self._file.read(length))
         self._file.truncate(length)
         self._file.seek(0, os.SEEK_END)
-        try:
-            return [json.loads(line) for line in content.decode("utf-8").splitlines()]
-        except ValueError:
-            raise InputError(f"{METRICS} is damaged: it holds lines that are no JSON") from None
+        return rows
 
     def add(self, series: str, steps: int, metrics: Mapping[str, float]) -> None:
         """Write one row, for example ``add("ppo", 16384, {"success_rate": 0.5})``."""
         row = {"steps": steps, **metrics}
-        # JSON has no NaN: a rate that is not known yet is left out.
-        finite = {name: value for name, value in row.items() if value == value}
+        # JSON has no NaN and no infinity: a rate that is not known yet is left out.
+        finite = {name: value for name, value in row.items() if math.isfinite(value)}
         self._file.write((json.dumps({"series": series, **finite}) + "\n").encode("utf-8"))
         self._file.flush()
         self._keep(series, finite)
@@ -196,6 +196,38 @@ class MetricsLog:
         self._events.close()
 
 
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """The rows of a run's metrics.
+
+    Raises:
+        InputError: When the file cannot be read as such.
+    """
+    try:
+        return _rows(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{str(path)!r} cannot be read: {error.strerror}") from None
+
+
+def _rows(content: bytes) -> list[dict[str, Any]]:
+    try:
+        return [_row(line) for line in content.decode("utf-8").splitlines()]
+    except ValueError as error:
+        raise InputError(f"{METRICS} is damaged: a line is no row of metrics: {error}") from None
+
+
+def _row(line: str) -> dict[str, Any]:
+    """A row of metrics from a file, as ``add`` wrote it; ValueError if it is none."""
+    row = parse_object(line)
+    numbers = [value for name, value in row.items() if name != "series"]
+    if not isinstance(row.get("series"), str) or not all(text.isprintable() for text in (*row, row["series"])):
+        raise ValueError("it has no series")
+    if not all(isinstance(number, int | float) and abs(number) < 1e300 for number in numbers):
+        raise ValueError("it holds more than numbers")
+    if not 0 <= row.get("steps", -1) < 2**53:
+        raise ValueError("it has no steps")
+    return row
+
+
 def _free_path(name: str) -> Path:
     """``runs/<name>-<time>``, with a number where two runs start in one second."""
     stamp = time.strftime("%Y%m%d-%H%M%S")
@@ -221,11 +253,8 @@ def read_json(path: Path) -> dict[str, Any]:
         InputError: When the file cannot be read as one.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        return read_object(path)
     except OSError as error:
         raise InputError(f"{str(path)!r} cannot be read: {error.strerror}") from None
-    except ValueError:
-        raise InputError(f"{str(path)!r} is not valid JSON") from None
-    if not isinstance(content, dict):
-        raise InputError(f"{str(path)!r} must hold one JSON object")
-    return content
+    except ValueError as error:
+        raise InputError(f"{str(path)!r} is not valid JSON: {error}") from None

@@ -6,21 +6,20 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal, Self
 
 import numpy as np
 
 from gridnav.agents import Agent, OnProgress, Planner, Progress, QLearning
-from gridnav.envs import NavigationVectorEnv
+from gridnav.envs import LayoutMix, NavigationVectorEnv
 from gridnav.experiment.checkpoint import Checkpoint, Standing, load_checkpoint, save_checkpoint
-from gridnav.experiment.evaluation import evaluate, make_worlds, policy_for
+from gridnav.experiment.evaluation import evaluate_in
 from gridnav.experiment.presets import choose_config
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
-from gridnav.problem.layout import Layout
+from gridnav.experiment.worlds import Problem
 from gridnav.problem.metrics import Episode, Summary, summarise
-from gridnav.problem.reward import Reward
-from gridnav.problem.task import Task
 from gridnav.problem.types import InputError, IntArray, State
 
 AgentKind = Literal["plan", "q-learning", "dqn", "ppo"]
@@ -55,45 +54,23 @@ CHECKPOINT_SHARE = 0.01
 
 
 @dataclass(frozen=True)
-class Problem:
-    """Layout, task and reward, the same in every world."""
-
-    layout: Layout
-    task: Task
-    reward: Reward
-
-    @classmethod
-    def load(cls, layout: str, task: str, reward: str) -> Problem:
-        """From names (and a path or text for the layout).
-
-        Raises:
-            InputError: When one of them is unknown or wrong.
-        """
-        return cls(Layout.load(layout), Task.load(task), Reward.load(reward))
-
-    def worlds(self, world: str, num_envs: int, **options: Any) -> NavigationVectorEnv:
-        """Robots that play this problem."""
-        return make_worlds(
-            world, num_envs, **{"layout": self.layout, "task": self.task, "reward": self.reward, **options}
-        )
-
-
-@dataclass(frozen=True)
 class Choice:
     """What one may choose about an agent."""
 
     preset: str = ""
-    """Name of its hyper-parameters; by default those made for what it observes."""
+    """Name of its hyper-parameters; by default those made for the problem and what it observes."""
     changes: Mapping[str, str] = field(default_factory=dict)
     """Hyper-parameters that differ from the preset: values in words, by name."""
     observation: str = "cell_goal"
     """What it sees on the grid: ``cell_goal``, ``cell`` or ``features``."""
 
-    def preset_of(self, kind: AgentKind) -> str:
+    def preset_of(self, kind: AgentKind, problem: Problem) -> str:
         """The preset's name for a kind of agent."""
         if self.preset:
             return self.preset
-        return self.observation if kind in OBSERVATIONS and self.observation != "cell_goal" else "default"
+        if kind == "ppo":
+            return "layouts" if problem.family else "any" if problem.task.goals == "any" else "default"
+        return self.observation if self.observation != "cell_goal" else "default"
 
 
 @dataclass(frozen=True)
@@ -138,7 +115,7 @@ class Result:
     observation: str = "cell_goal"
     """What it sees on the grid."""
 
-    @property
+    @cached_property
     def summary(self) -> Summary:
         """Metrics of the episodes."""
         return summarise(self.episodes)
@@ -206,12 +183,11 @@ class Workshop:
         report = self._on_stage(f"training {name}")
         agent, worlds, steps = make_learner(self.problem, kind, world, self.seed, self.budget, choice, start)
         if saved is not None:
-            assert saved.worlds is not None
             agent = saved.agent
-            worlds.set_state(saved.worlds)
-        visits = np.zeros(self.problem.layout.walls.shape, dtype=np.int64)
-        if saved is not None and saved.visits is not None:
-            visits = saved.visits
+            _bring_back(worlds, saved, name)
+        visits = None if saved is None else saved.visits
+        if saved is None and isinstance(worlds, NavigationVectorEnv):
+            visits = np.zeros(worlds.layout.walls.shape, dtype=np.int64)
         before = saved.standing if saved is not None else Standing(run_steps=self._run_steps)
         began = time.perf_counter()
 
@@ -220,7 +196,7 @@ class Workshop:
             run_steps = before.run_steps + taken - before.steps
             return Standing(taken, seconds, run_steps, self._log.sync(), is_finished)
 
-        taken = before.steps
+        taken, n_cuts = before.steps, 0
 
         def on_progress(progress: Progress) -> None:
             nonlocal taken
@@ -232,19 +208,31 @@ class Workshop:
             clock = _Clock(self._checkpoint_s)
 
             def on_cut(training: Callable[[], State]) -> None:
-                np.add.at(visits, tuple(worlds.cells.T), 1)
-                if not clock.is_due and not interruption.is_asked:
-                    return
-                with clock:
-                    here = Checkpoint(agent, standing(is_finished=False), training(), worlds.get_state(), visits)
-                    save_checkpoint(self._run.checkpoints, name, here)
+                nonlocal n_cuts
+                n_cuts += 1
+                is_saved = saved is not None and n_cuts == 1  # it is the cut that the checkpoint was made at
+                if not is_saved and (clock.is_due or interruption.is_asked):
+                    with clock:
+                        here = Checkpoint(agent, standing(is_finished=False), training(), worlds.get_state(), visits)
+                        save_checkpoint(self._run.checkpoints, name, here)
                 if interruption.is_asked:
                     raise KeyboardInterrupt
+                # After the checkpoint, for a continued training comes by here again.
+                if visits is not None and isinstance(worlds, NavigationVectorEnv):
+                    np.add.at(visits, tuple(worlds.cells.T), 1)
 
             resume = saved.training if saved is not None else None
-            agent.learn(worlds, steps=steps, on_progress=on_progress, on_cut=on_cut, resume=resume)
+            try:
+                agent.learn(worlds, steps=steps, on_progress=on_progress, on_cut=on_cut, resume=resume)
+            except UNFIT as error:
+                # Until a first piece of training is through, it is the checkpoint's fault.
+                if saved is None or n_cuts > 1:
+                    raise
+                raise InputError(f"the checkpoint of {name!r} does not fit its training: {error!r:.100}") from error
             end = standing(is_finished=True)
             save_checkpoint(self._run.checkpoints, name, Checkpoint(agent, end, None, None, visits))
+            if interruption.is_asked:
+                raise KeyboardInterrupt
         worlds.close()
         self._run_steps = end.run_steps
         return Trained(name, agent, end.steps, end.seconds, world, choice.observation, visits)
@@ -260,12 +248,29 @@ class Workshop:
             carried: What it took over from another rung, in words. Training counts in the row of the same name.
         """
         report = self._on_stage(f"evaluating {name}")
-        worlds = self.problem.worlds(world, self.budget.episodes, **grid_options(world, trained.observation))
-        episodes = evaluate(policy_for(trained.agent, worlds), worlds, on_progress=report)
-        worlds.close()
+        episodes = evaluate_in(
+            self.problem, trained.agent, world, self.budget.episodes,
+            observation=trained.observation, on_progress=report,
+        )  # fmt: skip
         own = name == trained.name
         steps, seconds = (trained.steps, trained.seconds) if own else (0, 0.0)
         return Result(name, world, agent, carried, trained.name, episodes, steps, seconds, trained.observation)
+
+
+UNFIT = LookupError, TypeError, ValueError, AttributeError, RuntimeError
+"""What comes of a checkpoint whose parts are whole and do not belong together."""
+
+
+def _bring_back(worlds: NavigationVectorEnv | LayoutMix, saved: Checkpoint, name: str) -> None:
+    """Put the worlds where a checkpoint left them; InputError where it is not one of them."""
+    try:
+        if saved.worlds is None or saved.training is None:
+            raise InputError("it holds no training to go on with")
+        worlds.set_state(saved.worlds)
+        if saved.visits is not None and isinstance(worlds, NavigationVectorEnv):
+            np.add.at(saved.visits, tuple(worlds.cells.T), 0)
+    except UNFIT as error:
+        raise InputError(f"the checkpoint of {name!r} does not fit its worlds: {error!r:.100}") from error
 
 
 class Interruption:
@@ -315,7 +320,7 @@ def make_learner(
     budget: Budget,
     choice: Choice,
     start: Agent | None = None,
-) -> tuple[Agent, NavigationVectorEnv, int]:
+) -> tuple[Agent, NavigationVectorEnv | LayoutMix, int]:
     """An agent that has not learnt yet, the environments it learns in, and for how many steps.
 
     Args:
@@ -332,11 +337,10 @@ def make_learner(
     """
     if kind == "plan":
         return Planner.solve(problem.layout, problem.task, problem.reward), problem.worlds(world, 1), 0
-    config = choose_config(kind, choice.preset_of(kind), {"seed": str(seed), **choice.changes})
-    options = grid_options(world, choice.observation)
-    if config.exploring_starts:
-        options["task"] = replace(problem.task, starts="any")
-    worlds = problem.worlds(world, config.num_envs, **options)
+    config = choose_config(kind, choice.preset_of(kind, problem), {"seed": str(seed), **choice.changes})
+    worlds = problem.training_worlds(
+        world, config.num_envs, observation=choice.observation, exploring_starts=config.exploring_starts
+    )
     spaces = worlds.single_observation_space, worlds.single_action_space
     if kind == "q-learning":
         table = QLearning(*spaces, config)
@@ -353,7 +357,7 @@ def make_learner(
     return agent, worlds, int(agent.planned_steps * budget.share)
 
 
-def check_choice(kinds: Sequence[AgentKind], world: str, choice: Choice) -> None:
+def check_choice(kinds: Sequence[AgentKind], problem: Problem, world: str, choice: Choice) -> None:
     """Whether agents can be made of a choice, before anything is written.
 
     Raises:
@@ -361,17 +365,16 @@ def check_choice(kinds: Sequence[AgentKind], world: str, choice: Choice) -> None
     """
     for kind in kinds:
         check_fit(kind, world)
+        if problem.family and kind != "ppo" and choice.observation != "features":
+            raise InputError(
+                f"{kind} on random layouts needs to see them: take dqn with --observation features, or ppo"
+            )
         if world == "GridWorld" and choice.observation not in OBSERVATIONS[kind]:
             raise InputError(f"{kind} cannot observe {choice.observation}: it needs {' or '.join(OBSERVATIONS[kind])}")
         if world != "GridWorld" and choice.observation != "cell_goal":
             raise InputError(f"observation {choice.observation} is for gridnav/GridWorld-v0: robots observe features")
         if kind != "plan":
-            choose_config(kind, choice.preset_of(kind), choice.changes)
-
-
-def grid_options(world: str, observation: str) -> dict[str, Any]:
-    """What the grid alone is told: the robots have one observation."""
-    return {"observation": observation} if world == "GridWorld" else {}
+            choose_config(kind, choice.preset_of(kind, problem), choice.changes)
 
 
 def check_fit(kind: AgentKind, world: str) -> None:

@@ -13,11 +13,13 @@ import numpy as np
 from gridnav.problem.geodesic import clearances
 from gridnav.problem.layout import Layout
 from gridnav.problem.robot import Robot
-from gridnav.problem.statistics import kaplan_meier_median, mean, stratified_bootstrap, wilson_interval
+from gridnav.problem.statistics import cvar, kaplan_meier_median, mean, stratified_bootstrap, wilson_interval
 from gridnav.problem.types import Cell, FloatArray, IntArray
 
 STILL_SHARE = 0.05
 """A robot below this share of its top speed stands still: 1 cm/s for a Burger."""
+WORST = 0.1
+"""Share of the layouts that the CVaR looks at."""
 DRAWS = 2_000
 """Resamplings of the episodes for the intervals of a summary; its seed is fixed, so they are the same every time."""
 
@@ -95,11 +97,25 @@ class Episode:
     """How the robot moved, where a trace was recorded."""
     behaviours: dict[str, float] = field(default_factory=dict)
     """Share of the time spent in each behaviour of ``gridnav.problem.behaviour``, 0 for what did not last."""
+    layout: str = ""
+    """Name of the layout."""
 
     @property
     def needed_path_m(self) -> float:
         """Length of the shortest way to where the goal counts as reached, metres."""
         return max(self.shortest_path_m - self.goal_radius_m, 0.0)
+
+    @property
+    def length_ratio(self) -> float:
+        """The episode's part in the SPL."""
+        return float(
+            success_ratios([self.is_success], np.array([self.needed_path_m]), np.array([self.path_length_m]))[0]
+        )
+
+    @property
+    def time_ratio(self) -> float:
+        """The episode's part in the SCT."""
+        return float(success_ratios([self.is_success], np.array([self.shortest_time_s]), np.array([self.elapsed_s]))[0])
 
     def row(self) -> dict[str, object]:
         """The record without its trace, fit for JSON."""
@@ -148,6 +164,10 @@ class Summary:
     """Mean of the mean squared changes of action."""
     still_share: float | None
     """Mean share of the time in which the robot did not drive."""
+    layouts: int
+    """Layouts that the episodes were in."""
+    success_cvar: float
+    """Success in the worst tenth of the layouts (CVaR); with one layout, in that."""
     behaviours: dict[str, float]
     """Share of episodes that show each behaviour."""
 
@@ -235,6 +255,9 @@ def summarise(episodes: Sequence[Episode]) -> Summary:
     measured = float(sum(e.path_length_m for e in episodes if e.motion))
     turned = sum(m.turned_rad for m in motions)
     clearance = [m.clearance_m for m in motions if m.clearance_m is not None]
+    by_layout: dict[str, list[bool]] = {}
+    for episode in episodes:
+        by_layout.setdefault(episode.layout, []).append(episode.is_success)
     names = dict.fromkeys(name for e in episodes for name in e.behaviours)
     return Summary(
         episodes=len(episodes),
@@ -256,6 +279,8 @@ def summarise(episodes: Sequence[Episode]) -> Summary:
         jerk_m_s3=_mean_known(m.jerk_m_s3 for m in motions),
         action_change=_mean_known(m.action_change for m in motions),
         still_share=_mean_known(m.still_share for m in motions),
+        layouts=len(by_layout),
+        success_cvar=cvar([np.mean(one) for one in by_layout.values()], WORST),
         behaviours={name: float(np.mean([e.behaviours.get(name, 0.0) > 0 for e in episodes])) for name in names},
     )
 

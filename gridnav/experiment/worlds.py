@@ -1,0 +1,73 @@
+"""What is to be solved, and the worlds to solve it in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gymnasium as gym
+
+from gridnav.envs import LayoutMix, NavigationVectorEnv
+from gridnav.problem.layout import Layout
+from gridnav.problem.random_layouts import RandomLayouts
+from gridnav.problem.reward import Reward
+from gridnav.problem.task import Task
+
+RANDOM = "random"
+"""Name of the family of random layouts, where a layout's name is asked for."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Layout, task and reward, the same in every world."""
+
+    layout: Layout
+    task: Task
+    reward: Reward
+    family: RandomLayouts | None = None
+    """Layouts that training draws from; evaluation is in held-out ones, of which ``layout`` is the first."""
+
+    @classmethod
+    def load(cls, layout: str, task: str, reward: str) -> Problem:
+        """From names (and a path or text for the layout).
+
+        Raises:
+            InputError: When one of them is unknown or wrong.
+        """
+        family = RandomLayouts() if layout == RANDOM else None
+        maze = family.held_out(1)[0] if family else Layout.load(layout)
+        return cls(maze, Task.load(task), Reward.load(reward), family)
+
+    def worlds(
+        self, world: str, num_envs: int, *, observation: str = "cell_goal", layout: Layout | None = None
+    ) -> NavigationVectorEnv:
+        """Robots that play this problem, in its layout or in another one."""
+        return make_worlds(
+            world, num_envs, layout=layout or self.layout, task=self.task, reward=self.reward,
+            **_grid_options(world, observation),
+        )  # fmt: skip
+
+    def training_worlds(
+        self, world: str, num_envs: int, *, observation: str = "cell_goal", exploring_starts: bool = False
+    ) -> NavigationVectorEnv | LayoutMix:
+        """Robots to learn with: in layouts that change where there is a family, from any start if asked for."""
+        problem = replace(self, task=replace(self.task, starts="any")) if exploring_starts else self
+        if self.family is None:
+            return problem.worlds(world, num_envs, observation=observation)
+        return LayoutMix(
+            lambda layout, n: problem.worlds(world, n, observation=observation, layout=layout),
+            num_envs,
+            self.family.draw,
+        )
+
+
+def make_worlds(world: str, num_envs: int, **options: Any) -> NavigationVectorEnv:
+    """The vector form of ``GridWorld``, ``Unicycle`` or ``DiffDrive``, with its usual time limit."""
+    worlds = gym.make_vec(f"gridnav/{world}-v0", num_envs=num_envs, **options)
+    assert isinstance(worlds, NavigationVectorEnv)
+    return worlds
+
+
+def _grid_options(world: str, observation: str) -> dict[str, Any]:
+    """What the grid alone is told: robots observe features and nothing else."""
+    return {"observation": observation} if world == "GridWorld" else {}
