@@ -30,6 +30,9 @@ from .base import Agent, EpisodeWindow, OnCut, OnProgress, Progress, check_finit
 from .hyper_parameters import check_numbers
 from .torch_state import guard_gradients, load_optimizer_arrays, optimizer_arrays
 
+POSE = (27, 28, 29, 30)
+"""Where the robots' feature vector holds position and heading in the maze."""
+
 
 @dataclass(frozen=True)
 class PPOConfig:
@@ -65,8 +68,8 @@ class PPOConfig:
     acts greedily."""
     hidden: tuple[int, ...] = (64, 64)
     """Units of the hidden layers (tanh) of policy and value network."""
-    ignored: tuple[int, ...] = ()
-    """Numbers of the observation that the networks never see, such as a pose that they are not to learn by heart."""
+    ignored: tuple[int, ...] = POSE
+    """Numbers of the observation that the networks never see; by default the pose, lest they learn a maze by heart."""
     reward_scale: float = 1.0
     """Factor on the rewards the learner sees: it keeps the value network's gradient from crowding out the policy's."""
     exploring_starts: bool = False
@@ -78,7 +81,12 @@ class PPOConfig:
         check_numbers(self)
 
 
-PPO_PRESETS: dict[str, PPOConfig] = {"default": PPOConfig()}
+PPO_PRESETS: dict[str, PPOConfig] = {
+    "default": PPOConfig(),
+    "any": PPOConfig(steps=2_000_000),
+    "layouts": PPOConfig(steps=1_500_000),
+}
+"""By what they were made for: DiffDrive on ``classic``, any start to any goal, and layouts never seen in training."""
 
 
 class PPOAgent(Agent):
@@ -213,7 +221,7 @@ class Inputs(BaseFeaturesExtractor):
     def __init__(self, observation_space: Box, ignored: tuple[int, ...] = ()) -> None:
         super().__init__(observation_space, features_dim=int(np.prod(observation_space.shape)))
         seen = torch.ones(self.features_dim)
-        seen[list(ignored)] = 0.0
+        seen[[number for number in ignored if number < self.features_dim]] = 0.0
         self.register_buffer("seen", seen)
         self.register_buffer("is_length", torch.from_numpy(observation_space.low.ravel() == 0.0))
 

@@ -500,29 +500,36 @@ def _progress() -> Iterator[OnStage]:
     """A bar per training or evaluation, with the success rate."""
     columns = (
         TextColumn("{task.description:<28}"),
-        BarColumn(bar_width=20),
-        TextColumn("{task.fields[words]:<48}"),
+        BarColumn(bar_width=11),
+        TextColumn("{task.fields[words]:<29}"),
         TimeElapsedColumn(),
     )
-    with Progress(*columns, console=stderr) as bars:
+    bars = Progress(*columns, console=stderr)
 
-        def on_stage(name: str) -> OnProgress:
-            for earlier in bars.task_ids:
-                bars.update(earlier, total=1, completed=1)
-                bars.stop_task(earlier)
-            task = bars.add_task(name, total=None, words="")
+    def on_stage(name: str) -> OnProgress:
+        bars.start()  # not earlier: what is refused gets one line and no empty ones
+        for earlier in bars.task_ids:
+            bars.update(earlier, total=1, completed=1)
+            bars.stop_task(earlier)
+        task = bars.add_task(name, total=None, words="")
+        first: list[float] = []  # steps and seconds of the first report: a continued training has a past
 
-            def on_progress(learning: Learning) -> None:
-                success = learning.metrics.get("success_rate", float("nan"))
-                rate = learning.steps / (bars.tasks[task].elapsed or 1.0)
-                words = f"{learning.steps:>9,}/{learning.total_steps:<9,} {rate:>9,.0f}/s"
-                if success == success:
-                    words += f"  success {success:6.1%}"
-                bars.update(task, completed=learning.steps, total=learning.total_steps, words=words)
+        def on_progress(learning: Learning) -> None:
+            success = learning.metrics.get("success_rate", float("nan"))
+            first.extend(() if first else (learning.steps, bars.tasks[task].elapsed or 0.0))
+            seconds = (bars.tasks[task].elapsed or 0.0) - first[1]
+            words = f"{(learning.steps - first[0]) / seconds:>10,.0f}/s" if seconds > 0 else " " * 12
+            if success == success:
+                words += f"  success {success:6.1%}"
+            bars.update(task, completed=learning.steps, total=learning.total_steps, words=words)
 
-            return on_progress
+        return on_progress
 
+    try:
         yield on_stage
+    finally:
+        if bars.live.is_started:
+            bars.stop()
 
 
 def _show(results: Sequence[Result], run: RunDirectory | None, *, title: str = "") -> None:

@@ -2,27 +2,32 @@
 
 python scripts/measure.py q-learning                optimality and time of Q-learning, one goal and all goals, ten seeds
 python scripts/measure.py zero-shot                 the Q-table driving DiffDrive, 200 episodes, five seeds
-python scripts/measure.py ppo [SEED ...]            PPO on DiffDrive from scratch and warm-started
+python scripts/measure.py ppo [SEED ...]            PPO on DiffDrive, `classic`, from scratch, ten seeds
+python scripts/measure.py ppo-any [SEED ...]        the same from any start to any goal
+python scripts/measure.py ppo-layouts [SEED ...]    PPO on random layouts: trained on the Unicycle, evaluated in 100
+                                                    layouts that no training saw, on the Unicycle and on DiffDrive
+python scripts/measure.py ppo-warm [SEED ...]       PPO on DiffDrive, warm-started from the Unicycle
 python scripts/measure.py ppo-settings [SEED ...]   PPO's environments, rollout, batch, epochs and network compared
+python scripts/measure.py sac [SEED ...]            SAC of stable-baselines3 on DiffDrive, success against time
 """
 
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from gridnav.agents import Planner, QLearning, QLearningConfig
+from gridnav.agents import Planner, QLearning
 from gridnav.experiment.evaluation import evaluate, policy_for
 from gridnav.experiment.ladder import steps_to
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
-from gridnav.experiment.training import BUDGETS, Workshop
+from gridnav.experiment.training import BUDGETS, Choice, Workshop, make_learner
 from gridnav.experiment.worlds import Problem
-from gridnav.problem.metrics import summarise
+from gridnav.problem.metrics import Summary, summarise
 
 PROBLEM = Problem.load("classic", "default", "default")
 BUDGET = BUDGETS["default"]
@@ -84,40 +89,112 @@ def zero_shot() -> None:
         )
 
 
-def ppo(seeds: list[int]) -> None:
-    """From scratch, and warm-started from the Unicycle; the same evaluation episodes for all."""
+def ppo(problem: Problem, world: str, evaluated_in: Sequence[str], seeds: Sequence[int]) -> None:
+    """A preset's result: one line per seed, and a row with the medians and ranges."""
+    results: dict[str, list[tuple[Summary, float]]] = {name: [] for name in evaluated_in}
     for seed in seeds:
-        with _workshop(seed) as (workshop, log):
-            unicycle = workshop.train("ppo-unicycle", "ppo", "Unicycle")
-            for name, start in (("ppo-scratch", None), ("ppo-warm", unicycle.agent)):
-                trained = workshop.train(name, "ppo", "DiffDrive", start=start)
-                result = workshop.evaluate(name, trained, "DiffDrive", name)
-                summary, reached = result.summary, {share: steps_to(log, name, share) for share in (0.9, 0.95, 0.98)}
+        with _workshop(seed, problem) as (workshop, log):
+            trained = workshop.train("ppo", "ppo", world)
+            reached = {share: steps_to(log, "ppo", share) for share in (0.9, 0.95, 0.98)}
+            for name in evaluated_in:
+                summary = workshop.evaluate("ppo", trained, name, "ppo").summary
+                results[name].append((summary, trained.seconds))
+                low, high = summary.success_interval
                 print(
-                    f"seed {seed} {name}: success {summary.success_rate:.1%} (95 % interval "
-                    f"{summary.success_interval[0]:.1%} to {summary.success_interval[1]:.1%}), collision rate "
-                    f"{summary.collision_rate:.1%}, SPL {summary.spl:.2f}, {trained.steps:,} steps, "
+                    f"seed {seed} on {name}: success {summary.success_rate:.1%} ({low:.1%} to {high:.1%}), collision "
+                    f"rate {summary.collision_rate:.1%}, SPL {summary.spl:.2f}, worst tenth of {summary.layouts} layouts "
+                    f"{summary.success_cvar:.1%}, behaviours {summary.behaviours}, {trained.steps:,} steps, "
                     f"{trained.seconds:.0f} s, steps to a training success of {reached}",
                     flush=True,
                 )
-            print(f"seed {seed} ppo-unicycle: {unicycle.steps:,} steps, {unicycle.seconds:.0f} s", flush=True)
+    print("| evaluated on | seeds | success >= 99 % | success, each seed | no collision, each seed | SPL | training |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    for name, pairs in results.items():
+        successes = [summary.success_rate for summary, _ in pairs]
+        free = [1.0 - summary.collision_rate for summary, _ in pairs]
+        spl, seconds = [summary.spl for summary, _ in pairs], [took for _, took in pairs]
+        print(
+            f"| {name} | {seeds[0]} to {seeds[-1]} | {sum(x >= 0.99 for x in successes)} of {len(seeds)} | "
+            f"{', '.join(f'{100 * x:.1f}' for x in successes)} % | {', '.join(f'{100 * x:.1f}' for x in free)} % | "
+            f"{np.median(spl):.2f} | {np.median(seconds):.0f} s ({min(seconds):.0f} to {max(seconds):.0f}) |"
+        )
 
 
-def ppo_settings(seeds: list[int]) -> None:
+def ppo_warm(seeds: Sequence[int]) -> None:
+    """Started on the network that learnt on the Unicycle."""
+    for seed in seeds:
+        with _workshop(seed) as (workshop, log):
+            unicycle = workshop.train("ppo-unicycle", "ppo", "Unicycle")
+            trained = workshop.train("ppo-warm", "ppo", "DiffDrive", start=unicycle.agent)
+            summary = workshop.evaluate("ppo-warm", trained, "DiffDrive", "ppo-warm").summary
+            print(
+                f"seed {seed}: success {summary.success_rate:.1%}, collision rate {summary.collision_rate:.1%}, "
+                f"SPL {summary.spl:.2f}, {summary.behaviours}, {trained.steps:,} steps, {trained.seconds:.0f} s, "
+                f"95 % in training after {steps_to(log, 'ppo-warm', 0.95)}; Unicycle {unicycle.seconds:.0f} s",
+                flush=True,
+            )
+
+
+def sac(seeds: Sequence[int]) -> None:
+    """Stable-baselines3's SAC in the same environments, through the same adapter, for three times PPO's time."""
+    import torch
+    from gridnav.agents.ppo import Sb3VecEnv
+    from stable_baselines3 import SAC
+    from stable_baselines3.common.callbacks import BaseCallback
+
+    from gridnav.agents import PPO_PRESETS
+
+    class Clock(BaseCallback):
+        """Evaluates every 20 s of training, and stops after 180 s; evaluations do not count."""
+
+        def _on_training_start(self) -> None:
+            self.spent, self.asked, self.since = 0.0, 0.0, time.perf_counter()
+
+        def _on_step(self) -> bool:
+            now = time.perf_counter()
+            if self.spent + now - self.since < self.asked + 20.0:
+                return True
+            self.spent += now - self.since
+            self.asked += 20.0
+            summary = summarise(evaluate(lambda o: self.model.predict(o, deterministic=True)[0], judge))
+            print(
+                f"seed {seed}: {self.spent:.0f} s, {self.num_timesteps:,} steps: success {summary.success_rate:.1%}, "
+                f"collision rate {summary.collision_rate:.1%}",
+                flush=True,
+            )
+            self.since = time.perf_counter()
+            return self.spent < 180.0
+
+    judge = PROBLEM.worlds("DiffDrive", BUDGET.episodes)
+    for seed in seeds:
+        torch.set_num_threads(1)
+        worlds = PROBLEM.worlds("DiffDrive", 64)
+        model = SAC(
+            "MlpPolicy", Sb3VecEnv(worlds), seed=seed, device="cpu", gamma=PPO_PRESETS["default"].gamma,
+            learning_rate=1e-3, batch_size=512, buffer_size=500_000, learning_starts=5_000, train_freq=1,
+            gradient_steps=2, policy_kwargs={"net_arch": [64, 64]},
+        )  # fmt: skip
+        model.learn(10_000_000, callback=Clock())
+
+
+def ppo_settings(seeds: Sequence[int]) -> None:
     """Each setting with each seed: speed, steps to a training success of 95 %, and what the greedy policy achieves."""
     from gridnav.agents import PPOAgent, PPOConfig
 
     judge = PROBLEM.worlds("DiffDrive", BUDGET.episodes)
     for num_envs, n_steps, batch_size, n_epochs, units in PPO_SETTINGS:
         for seed in seeds:
-            config = PPOConfig(seed, num_envs, n_steps, batch_size, n_epochs, hidden=(units, units))
+            config = PPOConfig(
+                seed=seed, num_envs=num_envs, n_steps=n_steps, batch_size=batch_size, n_epochs=n_epochs,
+                hidden=(units, units),
+            )  # fmt: skip
             worlds = PROBLEM.worlds("DiffDrive", num_envs)
             agent = PPOAgent(worlds.single_observation_space, worlds.single_action_space, config)
             curve: list[tuple[int, float]] = []
             began = time.perf_counter()
             agent.learn(
                 worlds,
-                steps=BUDGET.ppo_steps,
+                steps=config.steps,
                 on_progress=lambda p, curve=curve: curve.append((p.steps, p.metrics["success_rate"])),
             )
             speed = curve[-1][0] / (time.perf_counter() - began)
@@ -132,31 +209,41 @@ def ppo_settings(seeds: list[int]) -> None:
 
 
 def _learn(seed: int, problem: Problem = PROBLEM) -> tuple[QLearning, float]:
-    config = QLearningConfig(seed=seed, gamma=problem.reward.gamma)
     began = time.perf_counter()
-    worlds = problem.worlds("GridWorld", config.num_envs, task=replace(problem.task, starts="any"))
-    table = QLearning(worlds.single_observation_space, worlds.single_action_space, config)
-    table.learn(worlds, steps=BUDGET.q_learning_visits * table.action_values.size)
+    table, worlds, steps = make_learner(problem, "q-learning", "GridWorld", seed, BUDGET, Choice())
+    assert isinstance(table, QLearning)
+    table.learn(worlds, steps=steps)
     return table, time.perf_counter() - began
 
 
 @contextmanager
-def _workshop(seed: int) -> Iterator[tuple[Workshop, MetricsLog]]:
-    with tempfile.TemporaryDirectory() as folder:
-        run = RunDirectory.create(Path(folder) / "run", "measure", {})
-        with MetricsLog(run) as log:
-            yield Workshop(PROBLEM, BUDGET, seed, run, log, lambda name: lambda progress: None), log
+def _workshop(seed: int, problem: Problem = PROBLEM) -> Iterator[tuple[Workshop, MetricsLog]]:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        RunDirectory.create(Path(folder) / "run", "measure", {}) as run,
+        MetricsLog(run) as log,
+    ):
+        yield Workshop(problem, BUDGET, seed, run, log, lambda name: lambda progress: None), log
 
 
 if __name__ == "__main__":
     what, *numbers = sys.argv[1:] or ["help"]
+    seeds = [int(number) for number in numbers]
     if what == "q-learning":
         q_learning()
     elif what == "zero-shot":
         zero_shot()
     elif what == "ppo":
-        ppo([int(number) for number in numbers] or [0, 1, 2])
+        ppo(PROBLEM, "DiffDrive", ["DiffDrive"], seeds or range(10))
+    elif what == "ppo-any":
+        ppo(Problem.load("classic", "any", "default"), "DiffDrive", ["DiffDrive"], seeds or range(10))
+    elif what == "ppo-layouts":
+        ppo(Problem.load("random", "default", "default"), "Unicycle", ["Unicycle", "DiffDrive"], seeds or range(3))
+    elif what == "ppo-warm":
+        ppo_warm(seeds or range(3))
     elif what == "ppo-settings":
-        ppo_settings([int(number) for number in numbers] or [0, 1, 2])
+        ppo_settings(seeds or range(3))
+    elif what == "sac":
+        sac(seeds or range(2))
     else:
         sys.exit(__doc__)

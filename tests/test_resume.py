@@ -22,9 +22,9 @@ from typing import Any
 import pytest
 from safetensors.numpy import load_file
 
-from gridnav.agents import Progress
+from gridnav.agents import Planner, Progress
 from gridnav.cli import main
-from gridnav.experiment.checkpoint import Standing, last_standing, load_checkpoint
+from gridnav.experiment.checkpoint import Standing, clear_leftovers, last_standing, load_checkpoint, save_agent
 from gridnav.experiment.results import evaluation, open_log
 from gridnav.experiment.run_directory import RunDirectory, RunInUseError
 from gridnav.experiment.training import CHECKPOINT_SHARE, AgentKind, Budget, Choice, Workshop, _Clock
@@ -38,16 +38,24 @@ KINDS: tuple[AgentKind, ...] = ("q-learning", "dqn", "ppo")
 WORLDS = {"q-learning": "GridWorld", "dqn": "GridWorld", "ppo": "DiffDrive"}
 EPISODES = {"q-learning": 50, "dqn": 4, "ppo": 2}
 CHANGES = {
-    # By hand: 12 cells x 1 goal x 4 moves x 100 visits = 4,800 steps in 300 batches.
-    "q-learning": {"num_envs": "16", "visits": "100"},
-    # 3,200 steps in 200 batches; the replay buffer has 62 rows and is written round three times.
+    # By hand: 12 cells x 1 goal x 4 moves x 50 visits = 2,400 steps in 150 batches, a report after every third.
+    "q-learning": {"num_envs": "16", "visits": "50"},
+    # 1,600 steps in 100 batches; the replay buffer has 31 rows and is written round three times.
     "dqn": {
-        "num_envs": "16", "steps": "16000", "hidden": "[16]", "batch_size": "32", "replay_size": "1000",
-        "warm_up": "100",
+        "num_envs": "16", "steps": "8000", "hidden": "[16]", "batch_size": "32", "replay_size": "500", "warm_up": "100",
     },
     # 1,280 steps in 20 rollouts.
     "ppo": {"num_envs": "8", "steps": "6400", "hidden": "[16]", "n_steps": "8", "batch_size": "32"},
 }  # fmt: skip
+
+CRASHES = {"q-learning": (3, 1, 7), "dqn": (3, 1, 7), "ppo": (2,) * 19}
+"""Reports in which a training breaks off, one after the other; for ppo it is after every rollout."""
+
+
+@pytest.fixture(autouse=True)
+def _without_waiting_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process that dies loses nothing it has written; only a power cut would, and hundreds of saves take time."""
+    monkeypatch.setattr(os, "fsync", lambda descriptor: None)
 
 
 class Crash(BaseException):
@@ -69,9 +77,12 @@ def train(run: RunDirectory, kind: AgentKind, *, crash_at: int = 0, checkpoint_s
         if next(reports) == crash_at:
             raise Crash
 
+    def on_stage(name: str) -> Callable[[Progress], None]:
+        return on_progress if name.startswith("training") else lambda progress: None
+
     problem, budget = Problem.load(LAYOUT, "default", "default"), Budget(QUICK, EPISODES[kind])
     with open_log(run) as log:
-        workshop = Workshop(problem, budget, 0, run, log, lambda name: on_progress, checkpoint_s=checkpoint_s)
+        workshop = Workshop(problem, budget, 0, run, log, on_stage, checkpoint_s=checkpoint_s)
         trained = workshop.train(kind, kind, WORLDS[kind], choice=Choice(changes=CHANGES[kind]))
         return rows_of(evaluation([workshop.evaluate(kind, trained, WORLDS[kind], kind)]))
 
@@ -121,9 +132,13 @@ def reference(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathF
 def test_a_training_that_breaks_off_goes_on_bit_for_bit(kind: AgentKind, tmp_path: Path, reference: Any) -> None:
     """What is compared holds agent, optimizer, replay buffer, environments, every random stream, visits and metrics."""
     run = new_run(tmp_path / "run")
-    for crash_at in (3, 1, 7):
+    touching = 0
+    for crash_at in CRASHES[kind]:
         with pytest.raises(Crash):
             train(run, kind, crash_at=crash_at)
+        if kind == "ppo":
+            worlds = load_file(max(run.checkpoints.glob("step-*")) / "worlds.safetensors")
+            touching += int((worlds["contact"] != 0.0).any(axis=1).sum())
 
     rows = train(run, kind)
 
@@ -134,19 +149,8 @@ def test_a_training_that_breaks_off_goes_on_bit_for_bit(kind: AgentKind, tmp_pat
     assert parts == {f"{p}.{end}" for p in ("agent", "training", "worlds", "visits") for end in ("json", "safetensors")}
     assert len({name.split("/")[1] for name in expected if name.startswith("checkpoints/")}) == 2
     assert rows == expected_rows
-
-
-def test_the_robots_were_in_contact_with_walls_at_the_cut(tmp_path: Path) -> None:
-    """Without contacts the test above would prove little about the engine's state."""
-    run = new_run(tmp_path / "run")
-    with pytest.raises(Crash):
-        train(run, "ppo", crash_at=10)
-
-    checkpoint = max(run.checkpoints.glob("step-*"))
-
-    worlds = load_file(checkpoint / "worlds.safetensors")
-    assert (worlds["contact"] != 0.0).any(axis=1).sum() >= 2
-    assert worlds["collisions"].sum() > 0
+    # Without robots at walls when it broke off, little would be proven about the engine's state.
+    assert touching or kind != "ppo"
 
 
 def test_rare_checkpoints_make_no_other_run(tmp_path: Path, reference: Any) -> None:
@@ -161,7 +165,7 @@ def test_rare_checkpoints_make_no_other_run(tmp_path: Path, reference: Any) -> N
     expected, expected_rows = reference("q-learning")
     own = fingerprint(run)
     final = [name for name in expected if "training" not in name and name in own]
-    assert {f"checkpoints/step-000000004800/{part}" for part in ("agent.safetensors", "visits.safetensors")} < {*final}
+    assert {f"checkpoints/step-000000002400/{part}" for part in ("agent.safetensors", "visits.safetensors")} < {*final}
     assert {name: own[name] for name in final} == {name: expected[name] for name in final}
     assert rows == expected_rows
 
@@ -207,7 +211,7 @@ def test_many_checkpoints_between_two_reports_all_count_as_newer(tmp_path: Path)
     problem, budget = Problem.load(LAYOUT, "default", "default"), Budget(QUICK, 4)
     with open_log(run) as log:
         Workshop(problem, budget, 0, run, log, lambda name: on_progress, checkpoint_s=0.0).train(
-            "q-learning", "q-learning", "GridWorld", choice=Choice(changes=CHANGES["q-learning"])
+            "q-learning", "q-learning", "GridWorld", choice=Choice(changes={"num_envs": "16", "visits": "100"})
         )
 
     assert states == [f"{16 * 6 * (i + 1)} {6 * (i + 1) - 1}" for i in range(50)]
@@ -233,15 +237,15 @@ def test_a_second_agent_of_a_run_goes_on_after_the_first(tmp_path: Path) -> None
     whole, cut = new_run(tmp_path / "whole"), new_run(tmp_path / "cut")
     train_both(whole)
 
-    for crash_at in (1, 30, 40):  # in the first, and twice in the second, which has 50 reports too
+    for crash_at in (10, 60, 20):  # in the first; in the second; in the second, of whose reports 30 are left
         with pytest.raises(Crash):
             train_both(cut, crash_at)
     train_both(cut)
 
     assert fingerprint(cut) == fingerprint(whole)
-    # By hand: 4,800 steps each, on one count of the run.
+    # By hand: 2,400 steps each, on one count of the run.
     assert last_standing(cut.checkpoints) == Standing(
-        4800, last_standing(cut.checkpoints).seconds, 9600, (cut.path / "metrics.jsonl").stat().st_size, True
+        2400, last_standing(cut.checkpoints).seconds, 4800, (cut.path / "metrics.jsonl").stat().st_size, True
     )
 
 
@@ -322,12 +326,12 @@ def in_a_child(work: Callable[[], None]) -> int:
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes that are made by fork")
 def test_whatever_write_sync_or_rename_a_run_dies_at_it_goes_on_bit_for_bit(tmp_path: Path, reference: Any) -> None:
-    """Four checkpoints are made, of which the third is the first to prune; each cut point is a process that dies."""
+    """Three checkpoints are made, of which the third is the first to prune; each cut point is a process that dies."""
     expected, expected_rows = reference("q-learning")
 
     def begin(run: RunDirectory, point: int) -> None:
         die_at(point)
-        # By hand: a report follows every 6 cuts; 4 checkpoints would be enough, so the first report is the end.
+        # By hand: the first report follows three cuts.
         with contextlib.suppress(Crash):
             train(run, "q-learning", crash_at=1)
 
@@ -346,24 +350,22 @@ def test_whatever_write_sync_or_rename_a_run_dies_at_it_goes_on_bit_for_bit(tmp_
             assert train(run, "q-learning", checkpoint_s=3600.0) == expected_rows
             own = fingerprint(run)
             assert own["metrics.jsonl"] == expected["metrics.jsonl"]
-            final = "checkpoints/step-000000004800/"
+            final = "checkpoints/step-000000002400/"
             assert {n: own[n] for n in own if n.startswith(final)} == {
                 n: expected[n] for n in expected if n.startswith(final)
             }
         shutil.rmtree(run.path)
 
-    # By hand, of one checkpoint: mkdir, 9 writes counted twice, 10 syncs, rename, sync of the folder and of the
-    # metrics: 32. Six of them, four of which prune with rename, 9 unlinks and 2 rmdirs: more than 200 in all.
-    assert died > 200
+    # By hand: a checkpoint is mkdir, 9 writes counted twice, 10 syncs, rename, and syncs of the folder and of the
+    # metrics: 32. Three are 96, the first makes the folder, and the last prunes by rename, 9 unlinks and rmdir.
+    assert died >= 3 * 32 + 1 + 11
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes that are made by fork")
 def test_a_death_while_an_old_checkpoint_is_pruned_does_not_stop_the_next_agent(tmp_path: Path) -> None:
     """Half a checkpoint is not to be taken for a damaged one of the agent that comes next."""
-    from gridnav.agents import Planner
-    from gridnav.experiment.checkpoint import clear_leftovers, save_agent
-
-    planner = Planner.solve(*(lambda p: (p.layout, p.task, p.reward))(Problem.load(LAYOUT, "default", "default")))
+    problem = Problem.load(LAYOUT, "default", "default")
+    planner = Planner.solve(problem.layout, problem.task, problem.reward)
 
     def prune(directory: Path, point: int) -> None:
         die_at(point)
@@ -454,6 +456,7 @@ def test_a_killed_command_goes_on_bit_for_bit(kind: AgentKind, n_kills: int, tmp
         rows = rows_of(json.loads(run.evaluation.read_text())["results"])
         assert not list(run_dir.rglob(".tmp-*"))
     else:  # figures and reports take seconds, and are the same for all
+        clear_leftovers(run.checkpoints)
         rows = train(run, kind)
     expected, expected_rows = reference(kind)
     assert fingerprint(run) == expected
@@ -461,9 +464,7 @@ def test_a_killed_command_goes_on_bit_for_bit(kind: AgentKind, n_kills: int, tmp
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupt_leaves_a_checkpoint_and_one_line(
-    number: signal.Signals, tmp_path: Path, reference: Any
-) -> None:
+def test_an_interrupt_leaves_a_checkpoint_and_one_line(number: signal.Signals, tmp_path: Path, reference: Any) -> None:
     run_dir = tmp_path / "run"
     rarely = [*words("q-learning", run_dir), "--checkpoint-s", "3600"]
     longer = [*rarely[: rarely.index("--set")], *rarely[-2:], "--set", "num_envs=16", "visits=100000"]
@@ -488,7 +489,7 @@ def test_an_interrupted_training_goes_on_bit_for_bit(tmp_path: Path, reference: 
     run = new_run(tmp_path / "run")
 
     def on_progress(progress: Progress) -> None:
-        if progress.steps == 16 * 6 * 9:
+        if progress.steps == 16 * 3 * 9:
             signal.raise_signal(signal.SIGTERM)
 
     problem, budget = Problem.load(LAYOUT, "default", "default"), Budget(QUICK, 50)
@@ -499,13 +500,22 @@ def test_an_interrupted_training_goes_on_bit_for_bit(tmp_path: Path, reference: 
     whole = load_checkpoint(run.checkpoints, "q-learning")
     assert whole is not None
     assert whole.training is not None
-    assert whole.training.values["batch"] == 6 * 9  # the step in which it came was finished
+    assert whole.training.values["batch"] == 3 * 9  # the step in which it came was finished
 
     assert train(run, "q-learning") == reference("q-learning")[1]
     assert fingerprint(run) == reference("q-learning")[0]
 
 
 # ---- Whose run it is ---------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A whole run of the command line."""
+    run_dir = tmp_path_factory.mktemp("finished") / "run"
+    with contextlib.redirect_stderr(io.StringIO()):
+        assert run_cli(*words("q-learning", run_dir)) == 0
+    return run_dir
 
 
 def one_line(capsys: pytest.CaptureFixture[str]) -> str:
@@ -517,11 +527,11 @@ def one_line(capsys: pytest.CaptureFixture[str]) -> str:
 
 @pytest.mark.parametrize("extra", [["--resume"], []])
 def test_a_second_process_is_refused_at_once_and_told_who_owns_the_run(
-    extra: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    extra: list[str], finished: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with RunDirectory.create(tmp_path / "run", "train", {"command": "train"}):
+    with RunDirectory.open(finished).own():
         began = time.monotonic()
-        assert run_cli("train", "--run-dir", str(tmp_path / "run"), *extra) == (3 if not extra else 3)
+        assert run_cli("train", "--run-dir", str(finished), *extra) == 3
         assert time.monotonic() - began < 1.0
 
     line = one_line(capsys)
@@ -557,7 +567,7 @@ def test_a_run_is_free_again_when_its_owner_was_killed(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes that are made by fork")
 def test_of_eight_that_start_at_once_in_one_directory_exactly_one_runs(tmp_path: Path) -> None:
-    for race in range(25):
+    for race in range(6):
         path = tmp_path / f"race-{race}"
         gate, start = os.pipe()
         children = []
@@ -591,15 +601,6 @@ def test_of_eight_that_start_at_once_in_one_directory_exactly_one_runs(tmp_path:
 # ---- What --resume takes -----------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A whole run of the command line."""
-    run_dir = tmp_path_factory.mktemp("finished") / "run"
-    with contextlib.redirect_stderr(io.StringIO()):
-        assert run_cli(*words("q-learning", run_dir)) == 0
-    return run_dir
-
-
 def contents(directory: Path) -> dict[str, bytes]:
     """Every file, but for those that say who owns the run."""
     files = (path for path in directory.rglob("*") if path.is_file() and path.name not in (".lock", ".owner"))
@@ -607,7 +608,7 @@ def contents(directory: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize(
-    ("words", "named"),
+    ("flags", "named"),
     [
         (["--seed", "7"], "--seed"),
         (["--layout", "classic"], "--layout"),
@@ -617,11 +618,11 @@ def contents(directory: Path) -> dict[str, bytes]:
     ],
 )
 def test_flags_that_the_run_was_not_begun_with_are_refused(
-    words: list[str], named: str, finished: Path, capsys: pytest.CaptureFixture[str]
+    flags: list[str], named: str, finished: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = contents(finished)
 
-    assert run_cli("train", "--resume", "--run-dir", str(finished), *words) == 2
+    assert run_cli("train", "--resume", "--run-dir", str(finished), *flags) == 2
 
     line = one_line(capsys)
     assert line.startswith(f"gridnav: {named} ")
@@ -646,7 +647,9 @@ def test_resuming_a_finished_run_changes_nothing_that_it_found(finished: Path, t
     assert run_cli("train", "--resume", "--run-dir", str(run_dir)) == 0
 
     after = contents(run_dir)
-    assert after.keys() - {n for n in after if "tfevents" in n} == before.keys() - {n for n in before if "tfevents" in n}
+    assert after.keys() - {n for n in after if "tfevents" in n} == before.keys() - {
+        n for n in before if "tfevents" in n
+    }
     assert {name: after[name] for name in same} == {name: before[name] for name in same}
     assert json.loads(after["evaluation.json"]) == json.loads(before["evaluation.json"])
 
@@ -695,6 +698,6 @@ def test_a_damaged_checkpoint_costs_its_interval_and_no_more(
     assert found.standing.is_finished
     name = f"checkpoints/{newest(run_dir)}/agent.safetensors"
     own, expected = fingerprint(RunDirectory.open(run_dir)), reference("q-learning")[0]
-    assert own[name] == expected["checkpoints/step-000000004800/agent.safetensors"]
+    assert own[name] == expected["checkpoints/step-000000002400/agent.safetensors"]
     assert own["metrics.jsonl"] == expected["metrics.jsonl"]
     assert capsys.readouterr().err.count("damaged") <= 1

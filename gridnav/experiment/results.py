@@ -183,6 +183,7 @@ def evaluate_again(run: RunDirectory, episodes: int, seed: int | None, on_stage:
     try:
         problem = Problem.load(config["layout"], config["task"], config["reward"])
         rows = {name: {key: row[key] for key in _NEEDED} for name, row in stored["results"].items()}
+        spent = {name: (row["training_steps"], row["training_seconds"]) for name, row in stored["results"].items()}
     except (KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{str(run.path)!r} is no whole run: its {error} is missing or damaged") from None
     results = []
@@ -193,5 +194,6 @@ def evaluate_again(run: RunDirectory, episodes: int, seed: int | None, on_stage:
             observation=row["observation"], seed=EVALUATION_SEED if seed is None else seed,
             on_progress=on_stage(f"evaluating {name}"),
         )  # fmt: skip
-        results.append(Result(name, episodes=records, **row))
+        steps, seconds = spent[name]
+        results.append(Result(name, episodes=records, steps=steps, seconds=seconds, **row))
     return results
