@@ -106,11 +106,11 @@ class Agent(ABC):
         state = read_state(directory, "agent")
         kind = state.values.pop("kind", None)
         if kind != cls.kind:
-            raise ValueError(f"{directory} holds an agent of kind {kind!r:.60}, not {cls.kind!r}")
+            raise ValueError(f"{directory.name} holds an agent of kind {kind!r:.60}, not {cls.kind!r}")
         try:
             return cls.from_state(state)
         except (KeyError, TypeError, RuntimeError) as error:  # RuntimeError: torch's word for weights that do not fit
-            raise ValueError(f"{directory} does not hold what an agent of kind {cls.kind!r} is made of") from error
+            raise ValueError(f"{directory.name} does not hold what an agent of kind {cls.kind!r} is made of") from error
 
 
 def write_state(state: State, directory: Path, name: str) -> None:
@@ -131,11 +131,11 @@ def read_state(directory: Path, name: str) -> State:
     try:
         arrays = load_file(directory / f"{name}.safetensors")
     except SafetensorError as error:
-        raise ValueError(f"{directory / name}.safetensors is damaged: {error}") from None
+        raise ValueError(f"{name}.safetensors is damaged: {error}") from None
     try:
         return State(arrays, read_object(directory / f"{name}.json"))
     except ValueError as error:
-        raise ValueError(f"{directory / name}.json is damaged: {error}") from None
+        raise ValueError(f"{name}.json is damaged: {error}") from None
 
 
 def reached(next_observations: NDArray[Any], info: dict[str, Any]) -> NDArray[Any]:

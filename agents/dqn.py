@@ -50,13 +50,15 @@ OWN_STREAMS = 0x44514E
 class DQNConfig(EpsilonGreedyConfig):
     """Hyper-parameters; the defaults solve GridWorld on ``classic``."""
 
-    num_envs: int = 64
+    num_envs: int = 32
     """Environments stepped together."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 2e-3
     """Adam's step size."""
     epsilon_end: float = 0.05
     """Probability of a random action at the end; it falls linearly over the planned steps."""
-    steps: int = 200_000
+    exploring_starts: bool = True
+    """What is learnt is to be right everywhere, not only on the ways that the task asks for."""
+    steps: int = 64_000
     """Environment steps of a training of the usual length."""
     hidden: tuple[int, ...] = (128, 128)
     """Units of the hidden layers (ReLU)."""
@@ -64,7 +66,7 @@ class DQNConfig(EpsilonGreedyConfig):
     """The network chooses the next action and the target network values it; otherwise the target network does both."""
     dueling: bool = True
     """The network sums a state's value and its actions' advantages."""
-    n_step: int = 3
+    n_step: int = 2
     """Rewards that a return sums before it bootstraps."""
     loss: Literal["huber", "mse"] = "huber"
     """Of the temporal-difference errors."""
@@ -76,7 +78,7 @@ class DQNConfig(EpsilonGreedyConfig):
     """Transitions before the first update."""
     updates_per_step: int = 1
     """Gradient updates after each vector step."""
-    target_every: int = 100
+    target_every: int = 20
     """Updates between copies of the network to the target network."""
     max_grad_norm: float = 10.0
     """Longer gradients are scaled down to this Euclidean norm."""
@@ -92,6 +94,9 @@ class DQNConfig(EpsilonGreedyConfig):
 DQN_PRESETS: dict[str, DQNConfig] = {
     "default": DQNConfig(),
     "plain": DQNConfig(double=False, dueling=False),
+    "double": DQNConfig(dueling=False),
+    "dueling": DQNConfig(double=False),
+    "features": DQNConfig(learning_rate=1e-3, target_every=50, steps=96_000),
     "tutorial": DQNConfig(
         num_envs=1,
         learning_rate=1e-3,
@@ -100,6 +105,7 @@ DQN_PRESETS: dict[str, DQNConfig] = {
         epsilon_end=0.01,
         epsilon_decay=0.99,
         episodes=500,
+        exploring_starts=False,
         steps=50_000,
         hidden=(128, 128, 128),
         double=False,
@@ -114,6 +120,7 @@ DQN_PRESETS: dict[str, DQNConfig] = {
         max_grad_norm=1.0,
     ),
 }
+"""By name: what is in ``default`` switched off, other observations, and ``tutorial``, the tutorial's own agent."""
 
 
 def _dtype(observation_space: gym.Space[Any]) -> type:

@@ -48,6 +48,16 @@ Q_LEARNING_PRESETS: dict[str, QLearningConfig] = {
         exploring_starts=False,
         visits=125,
     ),
+    "cell": QLearningConfig(
+        num_envs=4,
+        learning_rate=0.075,
+        gamma=0.8,
+        epsilon_start=0.1,
+        epsilon_end=0.1,
+        episodes=500,
+        exploring_starts=False,
+        visits=125,
+    ),
 }
 """By name; ``tutorial`` is the tutorial's agent: 500 episodes of at most 100 moves."""
 
@@ -114,7 +124,8 @@ class QLearning(TabularAgent):
             next_observations, rewards, terminated, _, info = env.step(actions)
             # A truncated episode goes on beyond its last state, a terminated one does not.
             bootstrap = np.where(terminated, 0.0, q[reached(next_observations, info)].max(axis=1))
-            errors = rewards + config.gamma * bootstrap - q[observations, actions]
+            with np.errstate(over="ignore", invalid="ignore"):  # the next line says so, and where
+                errors = rewards + config.gamma * bootstrap - q[observations, actions]
             check_finite((batch + 1) * n, reward=rewards, td_error=errors)
             q[observations, actions] += config.learning_rate * errors
 

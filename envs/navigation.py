@@ -236,14 +236,14 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         if poses is None or poses.shape != self._pose.shape or not set(self.STATE) <= arrays.keys():
             raise InputError(f"the state is not that of {self.num_envs} environments of {self.world}")
         layout = self._own_layout
-        if values["layout"] is not None:
-            layout = Layout.load(values["layout"], cell_size_m=layout.cell_size_m)
+        if values["layout"] is not None:  # a text, never a path: the state may come from a file of somebody else
+            layout = Layout.from_text(values["layout"], cell_size_m=layout.cell_size_m)
+        fixed, layout = self._checked_options({**values["fixed"], "layout": layout})
+        self._check_state(arrays, layout)
         if layout != self.layout:
             self.layout = layout
             self._use_layout()
-        self._fixed = {
-            name: value if name == "heading_rad" else np.array(value) for name, value in values["fixed"].items()
-        }
+        self._fixed = fixed
         self._goal[:] = arrays["goal"]
         self._cell[:] = arrays["cell"]
         self._pose[:] = arrays["pose"]
@@ -257,6 +257,19 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         }
         self._streams.set_state(State(streams, values))
         self._has_reset = values["has_reset"]
+
+    def _check_state(self, arrays: dict[str, AnyArray], layout: Layout) -> None:
+        """InputError where arrays are not the batch's: compiled loops trust that cells and poses lie in the layout."""
+        for name in self.STATE:
+            own, array = getattr(self, f"_{name}"), arrays[name]
+            if array.shape != own.shape or array.dtype != own.dtype:
+                raise InputError(f"{name} of the state has shape {array.shape} and type {array.dtype}: it is no {name}")
+        for name in ("cell", "start", "goal"):
+            if (arrays[name] < 0).any() or (arrays[name] >= layout.walls.shape).any():
+                raise InputError(f"{name} of the state lies outside its layout")
+        poses, corner = arrays["pose"], np.array([layout.n_cols, layout.n_rows]) * layout.cell_size_m
+        if not np.isfinite(poses).all() or (poses[:, :2] < 0.0).any() or (poses[:, :2] > corner).any():
+            raise InputError("pose of the state lies outside its layout")
 
     @property
     def features(self) -> FeatureVector:

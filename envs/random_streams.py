@@ -40,6 +40,8 @@ class RandomStreams:
 
     def set_state(self, state: State) -> None:
         """Go on where the streams of ``state`` were; the generators stay the same objects."""
+        if (state.arrays["next"] < 0).any() or (state.arrays["next"] > self.BLOCK).any():
+            raise ValueError(f"a stream's next number must be one of a block of {self.BLOCK}")
         for generator, values in zip(self.generators, state.values["generators"], strict=True):
             generator.bit_generator.state = values
         self._block[:], self._next[:] = state.arrays["block"], state.arrays["next"]

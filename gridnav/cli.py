@@ -463,6 +463,9 @@ def _flags(name: str, config: Path) -> list[str]:
     flags = []
     for key, value in stored.items():
         flag = f"--{key.replace('_', '-')}"
+        words = value if isinstance(value, list) else []
+        if key.replace("-", "_") in OF_ONE_START or any(str(word).startswith("-") for word in words):
+            raise InputError(f"{str(config)!r} says {flag} {value!r:.60}, which is no part of a run's configuration")
         if not isinstance(value, list):
             flags.append(f"{flag}={value}")
         elif value:

@@ -102,8 +102,8 @@ def ppo(problem: Problem, world: str, evaluated_in: Sequence[str], seeds: Sequen
                 low, high = summary.success_interval
                 print(
                     f"seed {seed} on {name}: success {summary.success_rate:.1%} ({low:.1%} to {high:.1%}), collision "
-                    f"rate {summary.collision_rate:.1%}, SPL {summary.spl:.2f}, worst tenth of {summary.layouts} layouts "
-                    f"{summary.success_cvar:.1%}, behaviours {summary.behaviours}, {trained.steps:,} steps, "
+                    f"rate {summary.collision_rate:.1%}, SPL {summary.spl:.2f}, worst tenth of {summary.layouts} "
+                    f"layouts {summary.success_cvar:.1%}, {summary.behaviours}, {trained.steps:,} steps, "
                     f"{trained.seconds:.0f} s, steps to a training success of {reached}",
                     flush=True,
                 )

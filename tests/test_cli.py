@@ -1,11 +1,7 @@
 """The command line: exit codes, one-line errors, nothing written on bad input."""
 
 import json
-import os
-import signal
-import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -140,22 +136,6 @@ def test_a_trained_run_holds_what_the_contract_says_and_its_config_makes_it_agai
     assert run("evaluate", "first", "--episodes", "20", "--output", "again.json") == 0
     again = json.loads(Path("again.json").read_text())
     assert again["results"]["q-learning"]["success_rate"] == 1.0
-
-
-def test_an_interrupted_training_leaves_a_checkpoint_and_says_so(in_empty_folder: Path) -> None:
-    command = [sys.executable, "-m", "gridnav.cli", "train", "--agent", "q-learning", "--budget", "full"]
-    process = subprocess.Popen([*command, "--run-dir", "run"], stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 60
-    metrics = Path("run/metrics.jsonl")
-    while not (metrics.exists() and metrics.stat().st_size):
-        assert time.monotonic() < deadline, "training never began"
-        time.sleep(0.05)
-    os.kill(process.pid, signal.SIGINT)
-    _, errors = process.communicate(timeout=30)
-
-    assert process.returncode == 130
-    assert "Traceback" not in errors
-    assert list(Path("run/checkpoints").glob("step-*/manifest.json"))
 
 
 def test_debug_shows_the_traceback_and_keeps_the_exit_code(capsys: pytest.CaptureFixture[str]) -> None:

@@ -89,7 +89,7 @@ def train(run: RunDirectory, kind: AgentKind, *, crash_at: int = 0, checkpoint_s
 
 def rows_of(results: dict[str, Any]) -> dict[str, Any]:
     """An evaluation without its wall-clock time."""
-    ((_, row),) = results.items()
+    ((_, row),) = json.loads(json.dumps(results)).items()
     return {key: value for key, value in row.items() if key != "training_seconds"}
 
 
@@ -345,8 +345,8 @@ def test_whatever_write_sync_or_rename_a_run_dies_at_it_goes_on_bit_for_bit(tmp_
         if code == 0:
             break
         died += 1
-        # Going on from each of them costs time: every seventh, which falls on every kind of point in turn.
-        if point % 7 == 0:
+        # Going on from each of them costs time: every eleventh, which falls on every kind of point in turn.
+        if point % 11 == 0:
             assert train(run, "q-learning", checkpoint_s=3600.0) == expected_rows
             own = fingerprint(run)
             assert own["metrics.jsonl"] == expected["metrics.jsonl"]
@@ -460,7 +460,7 @@ def test_a_killed_command_goes_on_bit_for_bit(kind: AgentKind, n_kills: int, tmp
         rows = train(run, kind)
     expected, expected_rows = reference(kind)
     assert fingerprint(run) == expected
-    assert rows == json.loads(json.dumps(expected_rows))
+    assert rows == expected_rows
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -179,7 +179,8 @@ def _load(path: Path) -> Checkpoint:
         standing = Standing(**manifest["standing"])
         return Checkpoint(agent, standing, training, worlds, visits.arrays["visits"] if visits else None)
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(f"checkpoint {str(path)!r} cannot be used: {error}") from error
+        reason = " ".join(str(error).split())  # torch's have many lines
+        raise InputError(f"checkpoint {str(path)!r} cannot be used: {reason:.150}") from error
 
 
 def load_agent(directory: Path, name: str) -> Agent:

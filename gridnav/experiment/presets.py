@@ -50,7 +50,7 @@ def _value(name: str, words: str, kind: Any) -> Any:
     """What the words mean, for a field of this type."""
     try:
         value = json.loads(words, parse_constant=lambda constant: constant)
-    except ValueError:
+    except (ValueError, RecursionError):
         value = words
     if isinstance(value, list):
         value = tuple(value)
