@@ -53,7 +53,9 @@ class DQNConfig(EpsilonGreedyConfig):
     num_envs: int = 32
     """Environments stepped together."""
     learning_rate: float = 2e-3
-    """Adam's step size."""
+    """Adam's step size at the beginning."""
+    learning_rate_end: float | None = None
+    """If given, the step size falls linearly to this over the planned steps, or episodes where these are limited."""
     epsilon_end: float = 0.05
     """Probability of a random action at the end; it falls linearly over the planned steps."""
     exploring_starts: bool = True
@@ -82,6 +84,19 @@ class DQNConfig(EpsilonGreedyConfig):
     """Updates between copies of the network to the target network."""
     max_grad_norm: float = 10.0
     """Longer gradients are scaled down to this Euclidean norm."""
+
+    def step_size(self, share: float, episodes: int) -> float:
+        """Adam's step size.
+
+        Args:
+            share: Of the planned steps that are taken, in [0, 1].
+            episodes: That have ended.
+        """
+        if self.learning_rate_end is None:
+            return self.learning_rate
+        if self.episodes is not None:
+            share = max(share, min(1.0, episodes / self.episodes))
+        return self.learning_rate + (self.learning_rate_end - self.learning_rate) * share
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -118,6 +133,25 @@ DQN_PRESETS: dict[str, DQNConfig] = {
         updates_per_step=1,
         target_every=10,
         max_grad_norm=1.0,
+    ),
+    "cell": DQNConfig(
+        num_envs=8,
+        learning_rate=5e-3,
+        learning_rate_end=1e-4,
+        gamma=0.9,
+        epsilon_end=0.01,
+        epsilon_decay=0.99,
+        episodes=500,
+        exploring_starts=False,
+        steps=50_000,
+        hidden=(128,),
+        dueling=False,
+        loss="mse",
+        replay_size=2_000,
+        batch_size=128,
+        warm_up=500,
+        updates_per_step=2,
+        target_every=30,
     ),
 }
 """By name: what is in ``default`` switched off, other observations, and ``tutorial``, the tutorial's own agent."""
@@ -317,6 +351,15 @@ class Learner:
         self.optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate, fused=True)
         self.n_updates = 0
 
+    @property
+    def step_size(self) -> float:
+        """Adam's step size."""
+        return float(self.optimizer.param_groups[0]["lr"])
+
+    @step_size.setter
+    def step_size(self, value: float) -> None:
+        self.optimizer.param_groups[0]["lr"] = value
+
     def update(self, batch: Batch, steps: int) -> dict[str, float]:
         """One step of Adam towards the batch's targets; ``loss``, mean action value ``q`` and ``gradient_norm``.
 
@@ -473,6 +516,7 @@ class DQNAgent(Agent):
             check_finite(taken, reward=rewards, observation=led_to, next_observation=next_observations)
             replay.add(observations, actions, rewards, led_to, terminated, truncated)
             if replay.n_added * n >= config.warm_up:
+                learner.step_size = config.step_size(batch / n_batches, window.episodes)
                 for _ in range(config.updates_per_step):
                     drawn = replay.sample(drawing, config.batch_size, config.n_step, config.gamma)
                     learning = learner.update(drawn, taken)

@@ -31,10 +31,10 @@ from gridnav.display.figures import save_figure
 from gridnav.display.recording import ViewerError
 from gridnav.envs import RenderingError
 from gridnav.experiment.checkpoint import clear_leftovers
+from gridnav.experiment.course import CHECKPOINT_S
 from gridnav.experiment.run_directory import CONFIG, RunDirectory, read_json, write_json
 from gridnav.experiment.training import (
     BUDGETS,
-    CHECKPOINT_S,
     OBSERVATIONS,
     BudgetName,
     Choice,

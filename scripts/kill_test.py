@@ -145,9 +145,10 @@ training.save_checkpoint = timed
 learn = training.Workshop.train
 def whole(*arguments, **options):
     began = time.perf_counter()
-    found = learn(*arguments, **options)
-    print("COST", spent, time.perf_counter() - began)
-    return found
+    try:  # an interrupt ends it
+        return learn(*arguments, **options)
+    finally:
+        print("COST", spent, time.perf_counter() - began, flush=True)
 training.Workshop.train = whole
 cli.main(sys.argv[1:])
 """
@@ -169,7 +170,7 @@ def cost(agent: str, folder: Path, seconds: float) -> str:
     except subprocess.TimeoutExpired:
         process.send_signal(signal.SIGINT)
         told = process.communicate()[0]
-    spent, took = next(line for line in told.splitlines() if line.startswith("COST")).split()[1:]
+    spent, took = next(line for line in told.splitlines() if "COST" in line).split()[1:]
     return f"{float(spent) / float(took):.2%} of {float(took):.0f} s"
 
 
@@ -210,15 +211,14 @@ def main() -> None:
     parser.add_argument("--cost-s", type=float, default=60.0, help="seconds of the run that measures the cost; 0: none")
     parser.add_argument("--keep", type=Path, help="a folder to leave the runs in")
     options = parser.parse_args()
-    rows = []
+    print(HEAD, BAR, sep="\n", flush=True)
     for agent in options.agents:
         folder = Path(tempfile.mkdtemp(prefix=f"gridnav-kill-{agent}-", dir=options.keep))
         began = time.perf_counter()
-        rows.append(measure(agent, options, folder))
+        print(measure(agent, options, folder), flush=True)
         print(f"{agent}: {time.perf_counter() - began:.0f} s", file=sys.stderr)
         if options.keep is None:
             shutil.rmtree(folder)
-    print(HEAD, BAR, *rows, sep="\n")
 
 
 if __name__ == "__main__":

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Discrete
 
-from gridnav.agents import Planner, QLearning, QLearningConfig
-from gridnav.experiment.checkpoint import KEPT, load_agent, save_agent
-from gridnav.problem.types import InputError
+from gridnav.agents import Planner, QLearning, QLearningConfig, read_state, write_state
+from gridnav.experiment.checkpoint import KEPT, load_agent, load_checkpoint, save_agent
+from gridnav.problem.types import InputError, State
 
 
 def planner(value: float) -> Planner:
@@ -80,7 +80,7 @@ def test_what_is_saved_comes_back(tmp_path: Path) -> None:
 
 
 def test_the_newest_of_each_name_is_read(tmp_path: Path) -> None:
-    for step, name, value in ((1, "plan", 1.0), (2, "other", 2.0), (10, "plan", 10.0), (9, "plan", 9.0)):
+    for step, name, value in ((1, "plan", 1.0), (2, "other", 2.0), (9, "plan", 9.0), (10, "plan", 10.0)):
         save_agent(planner(value), tmp_path, step, name=name)
 
     assert loaded_value(tmp_path, "plan") == 10.0
@@ -105,6 +105,33 @@ def test_a_second_checkpoint_of_the_same_step_takes_the_next_name_and_counts_as_
 
     assert loaded_value(tmp_path) == 2.0
     assert {path.name for path in tmp_path.iterdir()} == {"step-000000000005", "step-000000000006"}
+
+
+def test_what_is_saved_later_counts_as_newer_whatever_pruning_has_freed(tmp_path: Path) -> None:
+    """Several checkpoints between two reports have one step number: the third frees the first one's name."""
+    for value in range(5):
+        save_agent(planner(value), tmp_path, 7, name="plan")
+        assert loaded_value(tmp_path) == value
+
+    # By hand: numbers 7 to 11, of which the last two are kept.
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["step-000000000010", "step-000000000011"]
+
+
+def test_damaged_checkpoints_of_another_agent_are_none_of_ones_business(tmp_path: Path) -> None:
+    flip(save_agent(planner(1.0), tmp_path, 1, name="first") / "agent.json")
+
+    assert load_checkpoint(tmp_path, "second") is None
+    with pytest.raises(InputError, match="holds no whole checkpoint of 'first'"):
+        load_checkpoint(tmp_path, "first")
+
+
+def test_one_number_comes_back_as_one_number_and_not_as_a_list(tmp_path: Path) -> None:
+    write_state(State({"step": np.array(7.0), "row": np.zeros((0, 3))}, {}), tmp_path, "part")
+
+    arrays = read_state(tmp_path, "part").arrays
+
+    assert arrays["step"].shape == ()
+    assert arrays["row"].shape == (0, 3)
 
 
 @pytest.mark.parametrize("broken", ["rename", "fsync"])

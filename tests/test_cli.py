@@ -1,7 +1,6 @@
 """The command line: exit codes, one-line errors, nothing written on bad input."""
 
 import json
-import sys
 from pathlib import Path
 
 import pytest

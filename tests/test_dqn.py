@@ -277,6 +277,16 @@ def test_the_target_network_follows_every_so_many_updates() -> None:
     assert equal == [False, False, True, False, False, True]
 
 
+def test_the_step_size_falls_over_the_planned_steps_or_episodes() -> None:
+    config = replace(SMALL, learning_rate=0.5, learning_rate_end=0.1)
+
+    # By hand: a quarter of the way from 0.5 to 0.1.
+    assert config.step_size(0.25, 40) == pytest.approx(0.4)
+    assert replace(config, episodes=80).step_size(0.25, 40) == pytest.approx(0.3)  # half of the episodes
+    assert replace(config, episodes=80).step_size(0.25, 90) == pytest.approx(0.1)  # never below the end
+    assert replace(config, learning_rate_end=None).step_size(0.25, 40) == 0.5
+
+
 def test_the_preset_tutorial_is_the_tutorials_agent() -> None:
     config = DQN_PRESETS["tutorial"]
     numbers = asdict(config)
@@ -284,6 +294,7 @@ def test_the_preset_tutorial_is_the_tutorials_agent() -> None:
     expected = {
         "num_envs": 1,
         "learning_rate": 1e-3,
+        "learning_rate_end": None,
         "gamma": 0.99,
         "epsilon_start": 1.0,
         "epsilon_end": 0.01,
@@ -320,7 +331,7 @@ def test_learning_bootstraps_at_a_truncation_and_nowhere_behind_a_termination(fe
     env = Steady(terminates=terminates, features=features)
     agent = agent_for(env, replace(SMALL, learning_rate=3e-3, target_every=1, n_step=3))
 
-    agent.learn(env, steps=4_000)
+    agent.learn(env, steps=2_800)
 
     states = torch.eye(2) if features else torch.arange(2)
     first, reached = agent.network(states).detach().max(dim=1).values.tolist()
@@ -421,7 +432,7 @@ class CutError(Exception):
 @pytest.mark.parametrize("observation", ["cell_goal", "features"])
 @pytest.mark.parametrize("cut_at", [0, 5, 90, 199])  # before warm-up, after it, with the replay buffer full
 def test_a_training_cut_in_two_is_the_same_bit_for_bit(observation: str, cut_at: int, tmp_path: Path) -> None:
-    config = replace(SMALL, replay_size=500)
+    config = replace(SMALL, replay_size=500, learning_rate_end=1e-4)
     whole_env = small_world(observation=observation)
     whole, whole_reports = agent_for(whole_env, config), list[Progress]()
     whole_end: list[State] = []

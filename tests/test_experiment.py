@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from gridnav.agents import Planner, Progress
-from gridnav.experiment.evaluation import evaluate, make_worlds, policy_for
+from gridnav.experiment.course import CHECKPOINT_S
+from gridnav.experiment.evaluation import evaluate, policy_for
 from gridnav.experiment.ladder import climb
 from gridnav.experiment.robot_lint import lint_robot
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
-from gridnav.experiment.training import CHECKPOINT_S, Budget, Problem
+from gridnav.experiment.training import Budget
+from gridnav.experiment.worlds import Problem, make_worlds
 from gridnav.problem.layout import Layout
 from gridnav.problem.metrics import summarise
 from gridnav.problem.reward import Reward, Transition

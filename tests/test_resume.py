@@ -25,9 +25,10 @@ from safetensors.numpy import load_file
 from gridnav.agents import Planner, Progress
 from gridnav.cli import main
 from gridnav.experiment.checkpoint import Standing, clear_leftovers, last_standing, load_checkpoint, save_agent
+from gridnav.experiment.course import CHECKPOINT_SHARE, Clock
 from gridnav.experiment.results import evaluation, open_log
 from gridnav.experiment.run_directory import RunDirectory, RunInUseError
-from gridnav.experiment.training import CHECKPOINT_SHARE, AgentKind, Budget, Choice, Workshop, _Clock
+from gridnav.experiment.training import AgentKind, Budget, Choice, Workshop
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.types import InputError
 
@@ -253,7 +254,7 @@ def test_checkpoints_wait_longer_where_they_take_longer(monkeypatch: pytest.Monk
     now = 100.0
     monkeypatch.setattr(time, "perf_counter", lambda: now)
 
-    def due_after(clock: _Clock, took_s: float) -> float:
+    def due_after(clock: Clock, took_s: float) -> float:
         nonlocal now
         assert clock.is_due
         with clock:
@@ -264,10 +265,10 @@ def test_checkpoints_wait_longer_where_they_take_longer(monkeypatch: pytest.Monk
         return now - began
 
     assert CHECKPOINT_SHARE == 0.01
-    clock = _Clock(10.0)
+    clock = Clock(10.0)
     assert due_after(clock, 0.0625) == 10.0  # by hand: 0.0625 s are 1 % of 6.25 s, less than the period
     assert due_after(clock, 0.5) == 50.0  # and 0.5 s are 1 % of 50 s
-    assert due_after(_Clock(0.0), 3.0) == 0.0  # at every opportunity
+    assert due_after(Clock(0.0), 3.0) == 0.0  # at every opportunity
 
 
 # ---- Death at every step of a save -------------------------------------------------------------

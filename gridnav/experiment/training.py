@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-import signal
-import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Literal, Self
+from typing import Literal
 
-import numpy as np
-
-from gridnav.agents import Agent, OnProgress, Planner, Progress, QLearning
+from gridnav.agents import Agent, OnProgress, Planner, QLearning
 from gridnav.envs import LayoutMix, NavigationVectorEnv
-from gridnav.experiment.checkpoint import Checkpoint, Standing, load_checkpoint, save_checkpoint
+from gridnav.experiment.checkpoint import Standing, load_checkpoint
+from gridnav.experiment.course import CHECKPOINT_S, Course, bring_back
 from gridnav.experiment.evaluation import evaluate_in
 from gridnav.experiment.presets import choose_config
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.metrics import Episode, Summary, summarise
-from gridnav.problem.types import InputError, IntArray, State
+from gridnav.problem.types import InputError, IntArray
 
 AgentKind = Literal["plan", "q-learning", "dqn", "ppo"]
 OBSERVATIONS: dict[AgentKind, tuple[str, ...]] = {
@@ -47,10 +43,6 @@ BUDGETS: dict[str, Budget] = {
     "default": Budget(share=1.0, episodes=200),
     "full": Budget(share=2.5, episodes=1000),
 }
-CHECKPOINT_S = 10.0
-"""Seconds between two checkpoints of a training."""
-CHECKPOINT_SHARE = 0.01
-"""Of the time of a training that its checkpoints may take: where one takes long, the next one waits longer."""
 
 
 @dataclass(frozen=True)
@@ -182,60 +174,15 @@ class Workshop:
             return Trained(name, saved.agent, there.steps, there.seconds, world, choice.observation, saved.visits)
         report = self._on_stage(f"training {name}")
         agent, worlds, steps = make_learner(self.problem, kind, world, self.seed, self.budget, choice, start)
+        before = Standing(run_steps=self._run_steps)
         if saved is not None:
-            agent = saved.agent
-            _bring_back(worlds, saved, name)
-        visits = None if saved is None else saved.visits
-        if saved is None and isinstance(worlds, NavigationVectorEnv):
-            visits = np.zeros(worlds.layout.walls.shape, dtype=np.int64)
-        before = saved.standing if saved is not None else Standing(run_steps=self._run_steps)
-        began = time.perf_counter()
-
-        def standing(*, is_finished: bool) -> Standing:
-            seconds = before.seconds + time.perf_counter() - began
-            run_steps = before.run_steps + taken - before.steps
-            return Standing(taken, seconds, run_steps, self._log.sync(), is_finished)
-
-        taken, n_cuts = before.steps, 0
-
-        def on_progress(progress: Progress) -> None:
-            nonlocal taken
-            taken = progress.steps
-            self._log.add(name, progress.steps, progress.metrics)
-            report(progress)
-
-        with Interruption() as interruption:
-            clock = _Clock(self._checkpoint_s)
-
-            def on_cut(training: Callable[[], State]) -> None:
-                nonlocal n_cuts
-                n_cuts += 1
-                is_saved = saved is not None and n_cuts == 1  # it is the cut that the checkpoint was made at
-                if not is_saved and (clock.is_due or interruption.is_asked):
-                    with clock:
-                        here = Checkpoint(agent, standing(is_finished=False), training(), worlds.get_state(), visits)
-                        save_checkpoint(self._run.checkpoints, name, here)
-                if interruption.is_asked:
-                    raise KeyboardInterrupt
-                # After the checkpoint, for a continued training comes by here again.
-                if visits is not None and isinstance(worlds, NavigationVectorEnv):
-                    np.add.at(visits, tuple(worlds.cells.T), 1)
-
-            resume = saved.training if saved is not None else None
-            try:
-                agent.learn(worlds, steps=steps, on_progress=on_progress, on_cut=on_cut, resume=resume)
-            except UNFIT as error:
-                # Until a first piece of training is through, it is the checkpoint's fault.
-                if saved is None or n_cuts > 1:
-                    raise
-                raise InputError(f"the checkpoint of {name!r} does not fit its training: {error!r:.100}") from error
-            end = standing(is_finished=True)
-            save_checkpoint(self._run.checkpoints, name, Checkpoint(agent, end, None, None, visits))
-            if interruption.is_asked:
-                raise KeyboardInterrupt
+            agent, before = saved.agent, saved.standing
+            bring_back(worlds, saved, name)
+        course = Course(name, agent, worlds, before, saved, self._run, self._log, report, self._checkpoint_s)
+        end = course.go(steps)
         worlds.close()
         self._run_steps = end.run_steps
-        return Trained(name, agent, end.steps, end.seconds, world, choice.observation, visits)
+        return Trained(name, agent, end.steps, end.seconds, world, choice.observation, course.visits)
 
     def evaluate(self, name: str, trained: Trained, world: str, agent: str, *, carried: str = "") -> Result:
         """Fixed-seed episodes of an agent in a world; an agent of the grid drives robots by grid moves.
@@ -255,61 +202,6 @@ class Workshop:
         own = name == trained.name
         steps, seconds = (trained.steps, trained.seconds) if own else (0, 0.0)
         return Result(name, world, agent, carried, trained.name, episodes, steps, seconds, trained.observation)
-
-
-UNFIT = LookupError, TypeError, ValueError, AttributeError, RuntimeError
-"""What comes of a checkpoint whose parts are whole and do not belong together."""
-
-
-def _bring_back(worlds: NavigationVectorEnv | LayoutMix, saved: Checkpoint, name: str) -> None:
-    """Put the worlds where a checkpoint left them; InputError where it is not one of them."""
-    try:
-        if saved.worlds is None or saved.training is None:
-            raise InputError("it holds no training to go on with")
-        worlds.set_state(saved.worlds)
-        if saved.visits is not None and isinstance(worlds, NavigationVectorEnv):
-            np.add.at(saved.visits, tuple(worlds.cells.T), 0)
-    except UNFIT as error:
-        raise InputError(f"the checkpoint of {name!r} does not fit its worlds: {error!r:.100}") from error
-
-
-class Interruption:
-    """SIGINT and SIGTERM as a request, which training answers at its next cut; a second one ends it at once."""
-
-    def __enter__(self) -> Self:
-        self.is_asked = False
-        self._before: dict[int, Any] = {}
-        if threading.current_thread() is threading.main_thread():
-            self._before = {number: signal.signal(number, self._note) for number in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _note(self, *_: object) -> None:
-        if self.is_asked:
-            raise KeyboardInterrupt
-        self.is_asked = True
-
-
-class _Clock:
-    """When the next checkpoint is due; a context around the making of one."""
-
-    def __init__(self, period_s: float) -> None:
-        self._period_s, self._due = period_s, time.perf_counter()
-
-    @property
-    def is_due(self) -> bool:
-        return time.perf_counter() >= self._due
-
-    def __enter__(self) -> None:
-        self._began = time.perf_counter()
-
-    def __exit__(self, *_: object) -> None:
-        now = time.perf_counter()
-        wait = max(self._period_s, (now - self._began) / CHECKPOINT_SHARE) if self._period_s else 0.0
-        self._due = now + wait
 
 
 def make_learner(
