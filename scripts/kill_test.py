@@ -132,24 +132,30 @@ def hashes(run: Path) -> dict[str, str]:
 COST = """
 import sys, time
 from gridnav import cli
-from gridnav.experiment import training
+from gridnav.experiment import checkpoint
+from gridnav.experiment.training import Workshop
 
-spent, save = 0.0, training.save_checkpoint
+spent, save, learn = 0.0, checkpoint.save_checkpoint, Workshop.train
+
 def timed(*arguments):
     global spent
     began = time.perf_counter()
-    found = save(*arguments)
-    spent += time.perf_counter() - began
-    return found
-training.save_checkpoint = timed
-learn = training.Workshop.train
+    try:
+        return save(*arguments)
+    finally:
+        spent += time.perf_counter() - began
+
 def whole(*arguments, **options):
     began = time.perf_counter()
     try:  # an interrupt ends it
         return learn(*arguments, **options)
     finally:
         print("COST", spent, time.perf_counter() - began, flush=True)
-training.Workshop.train = whole
+
+for module in [*sys.modules.values()]:  # wherever it was imported to
+    if getattr(module, "save_checkpoint", None) is save:
+        module.save_checkpoint = timed
+Workshop.train = whole
 cli.main(sys.argv[1:])
 """
 
@@ -159,11 +165,11 @@ def cost(agent: str, folder: Path, seconds: float) -> str:
     process = subprocess.Popen(
         [sys.executable, "-c", COST, "train", "--agent", agent, "--budget", "full", "--run-dir", str(folder / "cost")],
         stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
         text=True,
     )
     if not wait(process, lambda: newest(folder / "cost")):  # type: ignore[arg-type]
-        sys.exit(f"training {agent} ended before its first checkpoint")
+        sys.exit(f"training {agent} ended before its first checkpoint: {process.communicate()[1]}")
     # An interrupt ends training; where it is over sooner, its evaluation is not part of the time.
     try:
         told = process.communicate(timeout=seconds)[0]
