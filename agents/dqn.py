@@ -35,6 +35,7 @@ from gridnav.problem.types import AnyArray, BoolArray, FloatArray, InputError, I
 
 from .base import Agent, EpisodeWindow, OnCut, OnProgress, Progress, check_finite, reached
 from .hyper_parameters import EpsilonGreedyConfig
+from .torch_state import load_optimizer_arrays, optimizer_arrays
 
 REPORTS = 50
 """Progress reports per training."""
@@ -54,8 +55,6 @@ class DQNConfig(EpsilonGreedyConfig):
     """Environments stepped together."""
     learning_rate: float = 2e-3
     """Adam's step size at the beginning."""
-    learning_rate_end: float | None = None
-    """If given, the step size falls linearly to this over the planned steps, or episodes where these are limited."""
     epsilon_end: float = 0.05
     """Probability of a random action at the end; it falls linearly over the planned steps."""
     exploring_starts: bool = True
@@ -84,19 +83,6 @@ class DQNConfig(EpsilonGreedyConfig):
     """Updates between copies of the network to the target network."""
     max_grad_norm: float = 10.0
     """Longer gradients are scaled down to this Euclidean norm."""
-
-    def step_size(self, share: float, episodes: int) -> float:
-        """Adam's step size.
-
-        Args:
-            share: Of the planned steps that are taken, in [0, 1].
-            episodes: That have ended.
-        """
-        if self.learning_rate_end is None:
-            return self.learning_rate
-        if self.episodes is not None:
-            share = max(share, min(1.0, episodes / self.episodes))
-        return self.learning_rate + (self.learning_rate_end - self.learning_rate) * share
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -389,25 +375,14 @@ class Learner:
 
     def state(self) -> State:
         """A copy of all but the network's weights: the target network's, ``target.*``, and Adam's, ``optimizer.*``."""
-        target = {f"target.{name}": tensor for name, tensor in self.target_network.state_dict().items()}
-        moments = {
-            f"optimizer.{i}.{name}": tensor
-            for i, moments in self.optimizer.state_dict()["state"].items()
-            for name, tensor in moments.items()
-        }
-        arrays = {name: tensor.numpy().copy() for name, tensor in (target | moments).items()}
-        return State(arrays, {"n_updates": self.n_updates})
+        target = {f"target.{name}": tensor.numpy().copy() for name, tensor in self.target_network.state_dict().items()}
+        return State(target | optimizer_arrays(self.optimizer), {"n_updates": self.n_updates})
 
     def restore(self, state: State) -> None:
         """Go on from what ``state`` held."""
-        tensors = {name: torch.from_numpy(array.copy()) for name, array in state.arrays.items()}
-        self.target_network.load_state_dict(_below("target", tensors))
-        moments: dict[int, dict[str, Tensor]] = {}
-        for name, tensor in _below("optimizer", tensors).items():
-            i, _, what = name.partition(".")
-            # Files make an array of one number out of a number without axes, which Adam's count of steps is.
-            moments.setdefault(int(i), {})[what] = tensor.reshape(()) if what == "step" else tensor
-        self.optimizer.load_state_dict(self.optimizer.state_dict() | {"state": moments})
+        target = {name: torch.from_numpy(array.copy()) for name, array in _below("target", state.arrays).items()}
+        self.target_network.load_state_dict(target)
+        load_optimizer_arrays(self.optimizer, state.arrays)
         self.n_updates = state.values["n_updates"]
 
 
@@ -516,7 +491,7 @@ class DQNAgent(Agent):
             check_finite(taken, reward=rewards, observation=led_to, next_observation=next_observations)
             replay.add(observations, actions, rewards, led_to, terminated, truncated)
             if replay.n_added * n >= config.warm_up:
-                learner.step_size = config.step_size(batch / n_batches, window.episodes)
+                learner.step_size = config.rate(batch / n_batches, window.episodes)
                 for _ in range(config.updates_per_step):
                     drawn = replay.sample(drawing, config.batch_size, config.n_step, config.gamma)
                     learning = learner.update(drawn, taken)

@@ -17,6 +17,8 @@ class EpsilonGreedyConfig:
     """Environments stepped together."""
     learning_rate: float = 0.1
     """Of a table, the share of the temporal-difference error that a visit corrects; of a network, Adam's step size."""
+    learning_rate_end: float | None = None
+    """If given, the learning rate falls linearly to this over the planned steps, or episodes where these are limited."""
     gamma: float = 0.99
     """Discount per step, in [0, 1]."""
     epsilon_start: float = 1.0
@@ -43,6 +45,19 @@ class EpsilonGreedyConfig:
         if self.epsilon_decay is None:
             return self.epsilon_start + (self.epsilon_end - self.epsilon_start) * share
         return max(self.epsilon_end, self.epsilon_start * self.epsilon_decay**episodes)
+
+    def rate(self, share: float, episodes: int) -> float:
+        """Learning rate.
+
+        Args:
+            share: Of the planned steps that are taken, in [0, 1].
+            episodes: That have ended.
+        """
+        if self.learning_rate_end is None:
+            return self.learning_rate
+        if self.episodes is not None:
+            share = max(share, min(1.0, episodes / self.episodes))
+        return self.learning_rate + (self.learning_rate_end - self.learning_rate) * share
 
     def is_over(self, episodes: int) -> bool:
         """Whether this many ended episodes are all that training may have."""

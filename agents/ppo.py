@@ -89,7 +89,7 @@ class PPOConfig:
 
 PPO_PRESETS: dict[str, PPOConfig] = {
     "default": PPOConfig(),
-    "any": PPOConfig(steps=2_900_000),
+    "any": PPOConfig(steps=2_900_000, log_std_final=-3.0),
     "layouts": PPOConfig(steps=1_500_000, ignored=POSE),
 }
 """By what they were made for: DiffDrive on ``classic``, the same from any start to any goal, and layouts never seen in

@@ -49,11 +49,12 @@ Q_LEARNING_PRESETS: dict[str, QLearningConfig] = {
         visits=125,
     ),
     "cell": QLearningConfig(
-        num_envs=4,
-        learning_rate=0.06,
-        gamma=0.93,
+        num_envs=2,
+        learning_rate=0.135,
+        learning_rate_end=0.001,
+        gamma=0.81,
         epsilon_end=0.05,
-        epsilon_decay=0.99,
+        epsilon_decay=0.98,
         episodes=500,
         exploring_starts=False,
         visits=125,
@@ -127,7 +128,7 @@ class QLearning(TabularAgent):
             with np.errstate(over="ignore", invalid="ignore"):  # the next line says so, and where
                 errors = rewards + config.gamma * bootstrap - q[observations, actions]
             check_finite((batch + 1) * n, reward=rewards, td_error=errors)
-            q[observations, actions] += config.learning_rate * errors
+            q[observations, actions] += config.rate(batch / n_batches, window.episodes) * errors
 
             window.add(info)
             observations = next_observations

@@ -281,10 +281,10 @@ def test_the_step_size_falls_over_the_planned_steps_or_episodes() -> None:
     config = replace(SMALL, learning_rate=0.5, learning_rate_end=0.1)
 
     # By hand: a quarter of the way from 0.5 to 0.1.
-    assert config.step_size(0.25, 40) == pytest.approx(0.4)
-    assert replace(config, episodes=80).step_size(0.25, 40) == pytest.approx(0.3)  # half of the episodes
-    assert replace(config, episodes=80).step_size(0.25, 90) == pytest.approx(0.1)  # never below the end
-    assert replace(config, learning_rate_end=None).step_size(0.25, 40) == 0.5
+    assert config.rate(0.25, 40) == pytest.approx(0.4)
+    assert replace(config, episodes=80).rate(0.25, 40) == pytest.approx(0.3)  # half of the episodes
+    assert replace(config, episodes=80).rate(0.25, 90) == pytest.approx(0.1)  # never below the end
+    assert replace(config, learning_rate_end=None).rate(0.25, 40) == 0.5
 
 
 def test_the_preset_tutorial_is_the_tutorials_agent() -> None:
@@ -329,9 +329,9 @@ def test_the_preset_tutorial_is_the_tutorials_agent() -> None:
 @pytest.mark.parametrize("terminates", [False, True])
 def test_learning_bootstraps_at_a_truncation_and_nowhere_behind_a_termination(features: bool, terminates: bool) -> None:
     env = Steady(terminates=terminates, features=features)
-    agent = agent_for(env, replace(SMALL, learning_rate=3e-3, target_every=1, n_step=3))
+    agent = agent_for(env, replace(SMALL, learning_rate=1e-2, target_every=1, n_step=3))
 
-    agent.learn(env, steps=2_800)
+    agent.learn(env, steps=1_200)
 
     states = torch.eye(2) if features else torch.arange(2)
     first, reached = agent.network(states).detach().max(dim=1).values.tolist()
@@ -429,14 +429,17 @@ class CutError(Exception):
     """Ends a training."""
 
 
-@pytest.mark.parametrize("observation", ["cell_goal", "features"])
-@pytest.mark.parametrize("cut_at", [0, 5, 90, 199])  # before warm-up, after it, with the replay buffer full
+@pytest.mark.parametrize(
+    ("observation", "cut_at"),
+    # Before warm-up, after it, with the replay buffer full, before the last step.
+    [("cell_goal", 0), ("cell_goal", 5), ("cell_goal", 60), ("cell_goal", 119), ("features", 60)],
+)
 def test_a_training_cut_in_two_is_the_same_bit_for_bit(observation: str, cut_at: int, tmp_path: Path) -> None:
-    config = replace(SMALL, replay_size=500, learning_rate_end=1e-4)
+    config = replace(SMALL, replay_size=400, learning_rate_end=1e-4)
     whole_env = small_world(observation=observation)
     whole, whole_reports = agent_for(whole_env, config), list[Progress]()
     whole_end: list[State] = []
-    whole.learn(whole_env, steps=1_600, on_progress=whole_reports.append, on_cut=lambda s: whole_end.append(s()))
+    whole.learn(whole_env, steps=960, on_progress=whole_reports.append, on_cut=lambda s: whole_end.append(s()))
 
     env, reports, calls = small_world(observation=observation), list[Progress](), 0
 
@@ -450,18 +453,18 @@ def test_a_training_cut_in_two_is_the_same_bit_for_bit(observation: str, cut_at:
 
     agent = agent_for(env, config)
     with pytest.raises(CutError):
-        agent.learn(env, steps=1_600, on_progress=reports.append, on_cut=cut)
+        agent.learn(env, steps=960, on_progress=reports.append, on_cut=cut)
     second, end = DQNAgent.load(tmp_path), list[State]()
     resume = read_state(tmp_path, "training")
-    second.learn(env, steps=1_600, on_progress=reports.append, on_cut=lambda s: end.append(s()), resume=resume)
+    second.learn(env, steps=960, on_progress=reports.append, on_cut=lambda s: end.append(s()), resume=resume)
 
     assert same_bits(second.state().arrays, whole.state().arrays)
     assert repr(reports) == repr(whole_reports)  # as text, where NaN equals NaN
     # At the last cut: target network, Adam, replay buffer, generators and counters.
     assert same_bits(end[-1].arrays, whole_end[-1].arrays)
     assert end[-1].values == whole_end[-1].values
-    assert len(whole_end) == 200
-    assert len(end) == 200 - cut_at
+    assert len(whole_end) == 120
+    assert len(end) == 120 - cut_at
 
 
 def test_a_state_does_not_change_while_training_goes_on() -> None:

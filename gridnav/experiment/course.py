@@ -130,9 +130,7 @@ def bring_back(worlds: NavigationVectorEnv | LayoutMix, saved: Checkpoint, name:
             raise InputError("it holds no training to go on with")
         worlds.set_state(saved.worlds)
         if saved.visits is not None and isinstance(worlds, NavigationVectorEnv):
-            np.add.at(
-                saved.visits, tuple(worlds.cells.T), 0
-            )  # fails unless it is a map of this layout
+            np.add.at(saved.visits, tuple(worlds.cells.T), 0)  # fails unless it is a map of this layout
     except UNFIT as error:
         raise InputError(f"the checkpoint of {name!r} does not fit its worlds: {error!r:.100}") from error
 
