@@ -53,13 +53,15 @@ class DQNConfig(EpsilonGreedyConfig):
 
     num_envs: int = 32
     """Environments stepped together."""
-    learning_rate: float = 2e-3
+    learning_rate: float = 3e-3
     """Adam's step size at the beginning."""
+    learning_rate_end: float | None = 1e-4
+    """If given, the step size falls linearly to this over the planned steps, or episodes where these are limited."""
     epsilon_end: float = 0.05
     """Probability of a random action at the end; it falls linearly over the planned steps."""
     exploring_starts: bool = True
     """What is learnt is to be right everywhere, not only on the ways that the task asks for."""
-    steps: int = 64_000
+    steps: int = 80_000
     """Environment steps of a training of the usual length."""
     hidden: tuple[int, ...] = (128, 128)
     """Units of the hidden layers (ReLU)."""
@@ -101,6 +103,7 @@ DQN_PRESETS: dict[str, DQNConfig] = {
     "tutorial": DQNConfig(
         num_envs=1,
         learning_rate=1e-3,
+        learning_rate_end=None,
         gamma=0.99,
         epsilon_start=1.0,
         epsilon_end=0.01,

@@ -18,7 +18,7 @@ class EpsilonGreedyConfig:
     learning_rate: float = 0.1
     """Of a table, the share of the temporal-difference error that a visit corrects; of a network, Adam's step size."""
     learning_rate_end: float | None = None
-    """If given, the learning rate falls linearly to this over the planned steps, or episodes where these are limited."""
+    """If given, the learning rate falls linearly to this, over the planned steps or the episodes."""
     gamma: float = 0.99
     """Discount per step, in [0, 1]."""
     epsilon_start: float = 1.0
