@@ -99,7 +99,7 @@ DQN_PRESETS: dict[str, DQNConfig] = {
     "plain": DQNConfig(double=False, dueling=False),
     "double": DQNConfig(dueling=False),
     "dueling": DQNConfig(double=False),
-    "features": DQNConfig(learning_rate=1e-3, target_every=50, steps=96_000),
+    "features": DQNConfig(learning_rate=1e-3, learning_rate_end=None, target_every=50, steps=96_000),
     "tutorial": DQNConfig(
         num_envs=1,
         learning_rate=1e-3,

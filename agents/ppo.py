@@ -43,7 +43,7 @@ class PPOConfig:
 
     seed: int = 0
     """Of weights, exploration and batches."""
-    steps: int = 740_000
+    steps: int = 640_000
     """Environment steps of a training of the usual length."""
     num_envs: int = 256
     """Environments stepped together."""
@@ -66,7 +66,7 @@ class PPOConfig:
     log_std_final: float = -2.0
     """In the second half of the planned steps its upper bound falls linearly to this, so that what is trained is what
     acts greedily."""
-    hidden: tuple[int, ...] = (64, 64)
+    hidden: tuple[int, ...] = (128, 128)
     """Units of the hidden layers (tanh) of policy and value network."""
     ignored: tuple[int, ...] = ()
     """Numbers of the observation that the networks never see, such as ``POSE``, lest they learn a maze by heart."""
@@ -89,8 +89,8 @@ class PPOConfig:
 
 PPO_PRESETS: dict[str, PPOConfig] = {
     "default": PPOConfig(),
-    "any": PPOConfig(steps=2_900_000, log_std_final=-3.0),
-    "layouts": PPOConfig(steps=1_500_000, ignored=POSE),
+    "any": PPOConfig(steps=2_900_000, hidden=(64, 64), log_std_final=-3.0),
+    "layouts": PPOConfig(steps=1_500_000, hidden=(64, 64), ignored=POSE),
 }
 """By what they were made for: DiffDrive on ``classic``, the same from any start to any goal, and layouts never seen in
 training, where no pose is worth knowing; docs/ppo.md has what each reached."""
