@@ -31,7 +31,8 @@ from gridnav.display.figures import (
     visit_counts,
 )
 from gridnav.display.style import signed
-from gridnav.experiment.evaluation import evaluate, make_worlds
+from gridnav.experiment.evaluation import evaluate
+from gridnav.experiment.worlds import make_worlds
 from gridnav.problem.layout import Layout
 from gridnav.problem.metrics import Episode, Trace
 from gridnav.problem.robot import BURGER

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from gridnav.agents import Planner
 from gridnav.envs import NavigationVectorEnv
-from gridnav.experiment.evaluation import evaluate, make_worlds, policy_for
+from gridnav.experiment.evaluation import evaluate, policy_for
+from gridnav.experiment.worlds import make_worlds
 from gridnav.problem.geodesic import Geodesic
 from gridnav.problem.layout import Layout
 from gridnav.problem.metrics import Episode, Motion, Trace, driving_time, measure_motion, success_weighted, summarise
