@@ -131,6 +131,10 @@ class Ladder(_Run):
         from gridnav.experiment.ladder import climb
 
         problem, config = self._problem()
+        if problem.family is not None:
+            raise InputError(
+                "the ladder needs one maze: its plan and its table are of one; train ppo on random layouts"
+            )
         budget = BUDGETS[self.budget]
         with self._directory("ladder", config) as run, _progress() as on_stage:
             results = climb(
