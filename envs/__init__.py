@@ -9,7 +9,7 @@ from .gl import works as gl_works
 from .grid_moves import GridMoves, MoveDriver
 from .grid_world import GridWorldEnv, GridWorldVectorEnv
 from .layout_mix import LayoutMix
-from .lidar import Lidar, scan
+from .lidar import scan
 from .mjcf import build_spec
 from .navigation import NavigationVectorEnv
 from .observation import FeatureVector
@@ -25,7 +25,6 @@ __all__ = [
     "GridWorldEnv",
     "GridWorldVectorEnv",
     "LayoutMix",
-    "Lidar",
     "MoveDriver",
     "NavigationEnv",
     "NavigationVectorEnv",

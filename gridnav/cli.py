@@ -68,7 +68,7 @@ class _Run:
     budget: BudgetName = "default"
     """quick: a first look; default: the real thing; full: more of everything."""
     layout: str = "classic"
-    """A named layout, a text file, or a text."""
+    """A named layout, a text file, a text, or random: training on many, evaluation on others."""
     task: str = "default"
     """Starts, goals and what a collision does: default, any or fragile."""
     reward: str = "default"

@@ -5,8 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from gridnav.agents.ppo import POSE
 
+from gridnav.envs import FeatureVector
 from gridnav.experiment.presets import choose_config, presets
+from gridnav.problem.layout import Layout
+from gridnav.problem.robot import BURGER
 from gridnav.problem.types import InputError
 
 
@@ -130,3 +134,9 @@ def test_changes_leave_the_preset_as_it_is() -> None:
 
 def test_the_planner_has_no_hyper_parameters() -> None:
     assert presets("plan") == {}
+
+
+def test_the_pose_that_networks_may_ignore_is_where_the_robots_hold_it() -> None:
+    slices = FeatureVector(Layout.load("classic"), BURGER).slices
+
+    assert (*range(35)[slices["position"]], *range(35)[slices["heading"]]) == POSE

@@ -15,11 +15,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import EngFormatter, PercentFormatter
-from scipy import stats
 
 from gridnav.display import palette
 from gridnav.display.style import STYLE, WIDTH_IN, signed
 from gridnav.problem.metrics import Episode
+from gridnav.problem.statistics import iqm
 from gridnav.problem.types import AnyArray, FloatArray, InputError
 
 TARGET = 0.95
@@ -169,18 +169,13 @@ def across_seeds(curves: Sequence[Curve], rng: np.random.Generator) -> Band:
         )
     grid = np.linspace(low, high, N_GRID)
     values = np.stack([y[np.searchsorted(x, grid, side="right") - 1] for x, y in measured])
-    middle, words = _middle(values), _middle_words(len(values))
+    middle, words = iqm(values.T), _middle_words(len(values))
     if len(values) == 1:
         return Band(grid, middle, middle, middle, words)
     # Whole seeds are drawn, with replacement: the points of a curve are not independent.
     drawn = rng.integers(len(values), size=(N_RESAMPLES, len(values)))
-    lower, upper = np.percentile(_middle(values[drawn.T]), [2.5, 97.5], axis=0)
+    lower, upper = np.percentile(iqm(np.moveaxis(values[drawn.T], 0, -1)), [2.5, 97.5], axis=0)
     return Band(grid, middle, lower, upper, words)
-
-
-def _middle(values: FloatArray) -> FloatArray:
-    """Interquartile mean over the first axis, the seeds (Agarwal et al. 2021, section 4)."""
-    return np.asarray(stats.trim_mean(values, 0.25, axis=0))
 
 
 def _middle_words(n_seeds: int) -> str:

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from gridnav.display.figures import comparison
 from gridnav.experiment.run_directory import METRICS, RunDirectory, read_rows
 from gridnav.experiment.training import Result
-from gridnav.problem.metrics import Episode
+from gridnav.problem.metrics import by_layout
 from gridnav.problem.statistics import iqm, stratified_bootstrap
 from gridnav.problem.types import FloatArray, InputError
 
@@ -114,12 +114,11 @@ def _row(label: str, seeds: list[int], results: Sequence[Result]) -> AcrossSeeds
         "sct": lambda episodes: np.mean([episode.time_ratio for episode in episodes]),
         "collision_rate": lambda episodes: np.mean([episode.collisions > 0 for episode in episodes]),
     }
+    parts = [by_layout(result.episodes) for result in results]
     values: dict[str, Any] = {}
     for name, metric in metrics.items():
         # The layouts are the tasks; of each, every seed gives one score.
-        scores = [
-            [float(metric(part[layout])) for part in map(_by_layout, results)] for layout in _by_layout(results[0])
-        ]
+        scores = [[float(metric(part[layout])) for part in parts] for layout in parts[0]]
         values[name] = float(iqm(np.concatenate(scores)))
         values[f"{name}_interval"] = stratified_bootstrap(scores, rng=np.random.default_rng(0))
     return AcrossSeeds(
@@ -132,10 +131,3 @@ def _row(label: str, seeds: list[int], results: Sequence[Result]) -> AcrossSeeds
         training_seconds=float(np.median([result.seconds for result in results])),
         **values,
     )
-
-
-def _by_layout(result: Result) -> dict[str, list[Episode]]:
-    parts: dict[str, list[Episode]] = {}
-    for episode in result.episodes:
-        parts.setdefault(episode.layout, []).append(episode)
-    return parts

@@ -11,7 +11,7 @@ from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 
 from gridnav.agents import Agent, OnProgress, Progress, TabularAgent
-from gridnav.envs import Lidar, MoveDriver, NavigationVectorEnv
+from gridnav.envs import MoveDriver, NavigationVectorEnv
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.behaviour import diagnose
 from gridnav.problem.geodesic import Geodesic
@@ -147,7 +147,6 @@ class _Course:
     def __init__(self, worlds: NavigationVectorEnv) -> None:
         self._worlds = worlds
         self._on_grid = isinstance(worlds.single_action_space, Discrete)
-        self._lidar = Lidar(worlds.layout, worlds.robot)
         self._ends = [worlds.start_and_goal(i) for i in range(worlds.num_envs)]
         self._poses: list[AnyArray] = []
         self._scans: list[AnyArray] = []
@@ -158,7 +157,7 @@ class _Course:
 
     def add_state(self, info: dict[str, Any]) -> None:
         self._poses.append(info["pose"])
-        self._scans.append(self._lidar.scan(info["pose"]))
+        self._scans.append(self._worlds.scan(info["pose"]))
 
     def add_step(self, actions: AnyArray, rewards: AnyArray, info: dict[str, Any]) -> None:
         # Where an episode ended, the info is the next one's first: what led there is in final_info.

@@ -9,13 +9,12 @@ from difflib import get_close_matches
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+from gridnav import agents
 from gridnav.problem.types import InputError
 
 
 def presets(kind: str) -> dict[str, Any]:
     """The named hyper-parameters of a kind of agent; none for the planner."""
-    import gridnav.agents as agents  # torch takes seconds to import, and only networks need it
-
     names = {"q-learning": "Q_LEARNING_PRESETS", "dqn": "DQN_PRESETS", "ppo": "PPO_PRESETS"}
     return getattr(agents, names[kind]) if kind in names else {}
 

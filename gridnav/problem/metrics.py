@@ -242,6 +242,14 @@ def measure_motion(trace: Trace, layout: Layout, robot: Robot) -> Motion:
     )
 
 
+def by_layout(episodes: Sequence[Episode]) -> dict[str, list[Episode]]:
+    """The episodes of each layout, by its name."""
+    parts: dict[str, list[Episode]] = {}
+    for episode in episodes:
+        parts.setdefault(episode.layout, []).append(episode)
+    return parts
+
+
 def summarise(episodes: Sequence[Episode]) -> Summary:
     """All metrics of at least one episode."""
     successes = [episode.is_success for episode in episodes]
@@ -255,9 +263,7 @@ def summarise(episodes: Sequence[Episode]) -> Summary:
     measured = float(sum(e.path_length_m for e in episodes if e.motion))
     turned = sum(m.turned_rad for m in motions)
     clearance = [m.clearance_m for m in motions if m.clearance_m is not None]
-    by_layout: dict[str, list[bool]] = {}
-    for episode in episodes:
-        by_layout.setdefault(episode.layout, []).append(episode.is_success)
+    layouts = by_layout(episodes)
     names = dict.fromkeys(name for e in episodes for name in e.behaviours)
     return Summary(
         episodes=len(episodes),
@@ -279,8 +285,8 @@ def summarise(episodes: Sequence[Episode]) -> Summary:
         jerk_m_s3=_mean_known(m.jerk_m_s3 for m in motions),
         action_change=_mean_known(m.action_change for m in motions),
         still_share=_mean_known(m.still_share for m in motions),
-        layouts=len(by_layout),
-        success_cvar=cvar([np.mean(one) for one in by_layout.values()], WORST),
+        layouts=len(layouts),
+        success_cvar=cvar([np.mean([e.is_success for e in one]) for one in layouts.values()], WORST),
         behaviours={name: float(np.mean([e.behaviours.get(name, 0.0) > 0 for e in episodes])) for name in names},
     )
 
