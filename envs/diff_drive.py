@@ -17,7 +17,7 @@ from gridnav.problem.types import BoolArray, FloatArray, InputError, IntArray, S
 
 from . import gl
 from .mjcf import build_model
-from .robot_world import SAME_WALL, RobotEnv, RobotVectorEnv
+from .robot_world import GRAZING, SAME_WALL, RobotEnv, RobotVectorEnv
 
 TIMESTEP_S = 0.025
 """By measurement, see docs/speed.md: 10 ms is four times as accurate and takes more than twice as long."""
@@ -110,6 +110,7 @@ class DiffDriveVectorEnv(RobotVectorEnv):
                 n_substeps == 0,
                 self.task.on_collision != "slide",
                 SAME_WALL,
+                GRAZING,
                 self.release_m,
                 self.robot.radius_m,
                 self.robot.max_wheel_speed_rad_s,
@@ -123,7 +124,7 @@ class DiffDriveVectorEnv(RobotVectorEnv):
                 self._contact_is_inner,
                 self._travelled_m,
                 self._begins,
-                self._refused,
+                self._presses,
                 self._ctrl,
             )
         n_failed = _sense(
@@ -207,9 +208,9 @@ class DiffDriveEnv(RobotEnv[DiffDriveVectorEnv]):
     ## Episode start and end
 
     The task draws start, goal and heading; the robot starts at rest at a cell's centre. ``terminated`` within 0.15 m of
-    the goal's centre, or when the physics diverges (``info["physics_error"]``); a wall refuses commands into
-    it until the robot has turned or backed off. ``truncated`` after ``max_episode_steps`` (500 with
-    ``gym.make``: 100 s).
+    the goal's centre, or when the physics diverges (``info["physics_error"]``); a wall refuses commands into it, but
+    for those at less than 15 degrees, until the robot has turned or backed off. ``truncated`` after
+    ``max_episode_steps`` (500 with ``gym.make``: 100 s).
 
     ## Physics
 
@@ -242,6 +243,7 @@ def _bump(
     is_first: bool,
     stops: bool,
     same_wall: float,
+    grazing: float,
     release: float,
     radius: float,
     max_wheel_speed: float,
@@ -255,17 +257,18 @@ def _bump(
     contact_is_inner: BoolArray,
     travelled: FloatArray,
     begins: BoolArray,
-    refused: BoolArray,
+    presses: BoolArray,
     ctrl: FloatArray,
 ) -> None:
     """Note the contacts of the way since the last look, none at the first, and refuse what drives on into a wall."""
     for i in range(len(qpos)):
         forward = (wheels[i, 0] + wheels[i, 1]) / 2
         ahead_x, ahead_y = _ahead(qpos, i)
-        into = forward * (direction[i, 0] * ahead_x + direction[i, 1] * ahead_y) > INTO_WALL
+        towards = direction[i, 0] * ahead_x + direction[i, 1] * ahead_y
+        into = forward * towards > INTO_WALL
         x, y = qpos[i, 0], qpos[i, 1]
         if is_first:
-            travelled[i], begins[i], refused[i] = 0.0, False, False
+            travelled[i], begins[i], presses[i] = 0.0, False, False
         else:
             travelled[i] += np.sqrt((x - position[i, 0]) ** 2 + (y - position[i, 1]) ** 2)
             known = _along(contact, direction, i) > same_wall
@@ -276,8 +279,9 @@ def _bump(
             if gap[i] > radius + release:
                 contact[i] = 0.0
         position[i, 0], position[i, 1] = x, y
-        refuse = stops and into and _along(contact, direction, i) > same_wall
-        refused[i] |= refuse
+        meets = stops and into and _along(contact, direction, i) > same_wall
+        refuse = meets and abs(towards) > grazing
+        presses[i] |= refuse or (meets and gap[i] < radius + CONTACT_MARGIN_M)
         for side in range(2):
             ctrl[i, side] = (wheels[i, side] - (forward if refuse else 0.0)) * max_wheel_speed
 

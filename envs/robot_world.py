@@ -21,6 +21,12 @@ RELEASE_M = 0.02
 
 A robot that meets a wall at full speed bounces off by up to 11 mm. In narrow corridors it is less, see ``release_m``.
 """
+GRAZING = float(np.sin(np.deg2rad(15.0)))
+"""Sine of the angle to a wall up to which a robot is not stopped there but scrapes along, as a round bumper does.
+
+Were it stopped at any angle, a robot that brushes a corner would stand still with its way ahead open. Nothing is gained
+by scraping: it is counted and charged as pressing is.
+"""
 SAME_WALL = 0.7
 """Cosine of the angle up to which two directions of contact mean one wall: another wall is another collision."""
 
@@ -28,9 +34,10 @@ SAME_WALL = 0.7
 class RobotVectorEnv(NavigationVectorEnv):
     """``num_envs`` robots that take a forward and a turning command per control period.
 
-    A robot whose bumper meets a wall is stopped: it can turn and back off, and commands into the wall are refused. The
-    contact is counted once, and again for every cell-time that the robot keeps pressing, as the grid counts every bump.
-    Where the task lets robots slide, nothing is refused and every period with a contact is charged.
+    A robot whose bumper meets a wall is stopped: it can turn and back off, and commands into the wall are refused, but
+    for those that only graze it. The contact is counted once, and again for every cell-time that the robot keeps
+    pressing or scraping, as the grid counts every bump. Where the task lets robots slide, nothing is refused and every
+    period with a contact is charged.
 
     Args:
         num_envs: Robots in the batch.
@@ -38,7 +45,7 @@ class RobotVectorEnv(NavigationVectorEnv):
         shared: See ``NavigationVectorEnv``.
     """
 
-    STATE = (*NavigationVectorEnv.STATE, "contact", "contact_is_inner", "pressed_s", "begins", "refused")
+    STATE = (*NavigationVectorEnv.STATE, "contact", "contact_is_inner", "pressed_s", "begins", "presses")
 
     def __init__(self, num_envs: int = 1, *, control_period_s: float = 0.2, **shared: Any) -> None:
         if not 0.01 <= control_period_s <= 1.0:
@@ -68,8 +75,8 @@ class RobotVectorEnv(NavigationVectorEnv):
         self._contact: FloatArray = np.zeros((n, 2))
         self._contact_is_inner = np.zeros(n, dtype=bool)
         self._pressed_s: FloatArray = np.zeros(n)
-        # Of the last step: a contact began (or, sliding, went on), and a command into the wall was refused.
-        self._begins, self._refused = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+        # Of the last step: a contact began (or, sliding, went on), and the robot pressed on the wall or scraped along.
+        self._begins, self._presses = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
 
     def _place(self, ids: IntArray) -> None:
         self._goal_number[ids] = self._geodesic.goal_numbers(self._goal[ids])
@@ -93,7 +100,7 @@ class RobotVectorEnv(NavigationVectorEnv):
             self._goal,
             self._geodesic.distances(self._pose, self._goal_number),
             self._begins,
-            self._refused,
+            self._presses,
             self._contact_is_inner,
             self._failed,
             self._pressed_s,
@@ -110,7 +117,7 @@ class RobotVectorEnv(NavigationVectorEnv):
     def _roll(self, actions: FloatArray) -> None:
         """Drive for one control period.
 
-        Writes pose, speed, ``self._travelled_m``, ``self._begins``, ``self._refused`` and, where they change,
+        Writes pose, speed, ``self._travelled_m``, ``self._begins``, ``self._presses`` and, where they change,
         ``self._contact``, ``self._contact_is_inner`` and ``self._failed``.
         """
 
@@ -149,7 +156,7 @@ def _judge(
     goal: IntArray,
     to_goal_m: FloatArray,
     begins: BoolArray,
-    refused: BoolArray,
+    presses: BoolArray,
     contact_is_inner: BoolArray,
     failed: BoolArray,
     pressed_s: FloatArray,
@@ -164,7 +171,7 @@ def _judge(
     """What a period came to: collisions, one more for every cell-time of pressing, the cell, and arrival."""
     n_rows, n_cols = shape
     for i in range(len(pose)):
-        pressed_s[i] = pressed_s[i] + period_s if refused[i] and not begins[i] else 0.0
+        pressed_s[i] = pressed_s[i] + period_s if presses[i] and not begins[i] else 0.0
         again = pressed_s[i] >= cell_time_s
         if again:
             pressed_s[i] = 0.0

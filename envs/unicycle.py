@@ -12,7 +12,7 @@ from gridnav.problem.geodesic import clearance
 from gridnav.problem.types import BoolArray, FloatArray
 
 from .painter import Painter
-from .robot_world import SAME_WALL, RobotEnv, RobotVectorEnv
+from .robot_world import GRAZING, SAME_WALL, RobotEnv, RobotVectorEnv
 
 SUBSTEP_S = 0.01
 """Where a wall is near, contact is looked for this often: a robot at full speed moves 2 mm in it."""
@@ -49,7 +49,7 @@ class UnicycleVectorEnv(RobotVectorEnv):
             self._contact_is_inner,
             self._travelled_m,
             self._begins,
-            self._refused,
+            self._presses,
             self._speed,
         )
 
@@ -93,7 +93,8 @@ class UnicycleEnv(RobotEnv[UnicycleVectorEnv]):
     ## Episode start and end
 
     The task draws start, goal and heading; the robot starts at a cell's centre. ``terminated`` within 0.15 m of the
-    goal's centre; a wall refuses commands into it until the robot has turned or backed off. ``truncated`` after
+    goal's centre; a wall refuses commands into it, but for those at less than 15 degrees, until
+    the robot has turned or backed off. ``truncated`` after
     ``max_episode_steps`` (500 with ``gym.make``: 100 s).
 
     Args:
@@ -127,14 +128,14 @@ def _roll(
     contact_is_inner: BoolArray,
     travelled: FloatArray,
     begins: BoolArray,
-    refused: BoolArray,
+    presses: BoolArray,
     speeds: FloatArray,
 ) -> None:
     """Constant-twist arcs (Siegwart et al. 2011, section 3.2.3), without their forward part at a wall."""
     n_substeps = int(np.ceil(period / SUBSTEP_S - 1e-9))
     for i in range(len(poses)):
         x, y, heading = poses[i]
-        travelled[i], begins[i], refused[i] = 0.0, False, False
+        travelled[i], begins[i], presses[i] = 0.0, False, False
         forward, turning = (wheels[i, 0] + wheels[i, 1]) / 2, (wheels[i, 1] - wheels[i, 0]) / 2
         speed, turn = forward * max_speed, turning * max_turn
         # Far from walls one arc does; near them, short ones that look for contact.
@@ -148,15 +149,17 @@ def _roll(
             to_x, to_y = x + chord * np.cos(heading + turned / 2), y + chord * np.sin(heading + turned / 2)
             way = abs(speed) * dt
             gap, ux, uy, inner = clearance(to_x, to_y, walls, cell)
-            if gap < radius and (to_x - x) * ux + (to_y - y) * uy > 0.0:
+            into = (to_x - x) * ux + (to_y - y) * uy
+            if gap < radius and into > 0.0:
                 if slides or contact[i, 0] * ux + contact[i, 1] * uy <= SAME_WALL:
                     begins[i] = True
                 contact[i, 0], contact[i, 1] = ux, uy
                 contact_is_inner[i] = inner
-                refused[i] = not slides
-                if slides:
+                presses[i] = not slides
+                goes_on = slides or into <= GRAZING * abs(chord)
+                if goes_on:
                     to_x, to_y = to_x + ux * (gap - radius), to_y + uy * (gap - radius)
-                if not slides or clearance(to_x, to_y, walls, cell)[0] < radius - 1e-6:  # a second wall
+                if not goes_on or clearance(to_x, to_y, walls, cell)[0] < radius - 1e-6:  # a second wall
                     to_x, to_y = x, y
                 way = np.hypot(to_x - x, to_y - y)
             elif gap > radius + release:

@@ -324,6 +324,21 @@ def test_a_robot_that_drives_into_a_wall_stops_there(angle: float, forward: floa
     assert tilts_deg(env).max() < 2.0
 
 
+@pytest.mark.parametrize("forward", [1.0, -1.0])
+def test_a_robot_that_grazes_a_wall_is_not_stopped_until_friction_has_turned_it_to_the_wall(forward: float) -> None:
+    angle = np.pi / 2 - np.deg2rad(6.0)
+    env = start((8, 9), angle if forward > 0 else angle + np.pi)
+    infos = drive(env, forward, 0.0, 100)
+
+    hits = np.flatnonzero([info["collision"][0] for info in infos])
+    assert np.diff(hits).tolist() == [13] * ((99 - hits[0]) // 13)  # charged all the time
+    touched, rests = infos[hits[0]]["pose"][0], infos[-1]["pose"][0]
+    assert rests[1] - touched[1] > 0.05
+    assert np.rad2deg(abs(angle_between(rests[2], angle if forward > 0 else angle + np.pi))) > 9.0
+    gaps = wall_gaps(np.array([info["pose"][0, :2] for info in infos]), OPEN) - BURGER.radius_m
+    assert gaps.min() > -3e-3
+
+
 def test_turning_and_backing_off_at_a_wall_are_free() -> None:
     env = start((5, 9))
     pressed = drive(env, 1.0, 0.0, 10)[-1]["pose"][0]

@@ -192,6 +192,22 @@ def test_a_robot_at_a_wall_may_drive_along_it() -> None:
     assert along["collisions"][0] == 1
 
 
+@pytest.mark.parametrize("forward", [1.0, -1.0])
+def test_a_robot_that_grazes_a_wall_scrapes_along_it_and_pays_as_for_pressing(forward: float) -> None:
+    """At 10 degrees to the wall; the part of the speed along it is left, and each cell-time costs a collision."""
+    angle = np.pi / 2 - np.deg2rad(10.0)
+    env = start((8, 9), angle if forward > 0 else angle + np.pi)
+    infos = drive(env, forward, 0.0, 80)
+
+    hits = [bool(info["collision"][0]) for info in infos]
+    first = hits.index(True)
+    assert np.diff(np.flatnonzero(hits)).tolist() == [13] * ((79 - first) // 13)
+    way = infos[-1]["pose"][0] - infos[first]["pose"][0]
+    assert way[1] == pytest.approx(V * np.cos(np.deg2rad(10.0)) * (79 - first) * 0.2, rel=1e-6)
+    gaps = wall_gaps(np.array([info["pose"][0, :2] for info in infos]), env.layout)
+    assert gaps.min() >= BURGER.radius_m - 1e-6
+
+
 def test_sliding_goes_along_the_wall_and_every_step_of_it_is_charged() -> None:
     """Against a wall at 45 degrees: the part of the speed along the wall, 0.139 m/s, is left."""
     env = start((5, 9), np.pi / 4, task=Task("any", "any", "slide", 1e-6))

@@ -27,10 +27,11 @@ class Task:
     goals: Literal["layout", "any"] = "layout"
     """Goal cells: those of the layout, or every free cell that the starts reach."""
     on_collision: Literal["stop", "slide", "end"] = "stop"
-    """A robot that touches a wall is stopped and can only turn or back off, or slides on, or the episode ends.
+    """A robot that drives into a wall is stopped and can only turn or back off, or slides on, or the episode ends.
 
-    A contact is counted and charged in all three: once, and again for every cell-time of pressing; sliding, in every
-    step of it. A grid robot stays in its cell under ``stop`` and ``slide``.
+    A contact is counted and charged in all three: once, and again for every cell-time of pressing, or of scraping along
+    at less than 15 degrees, which is not stopped; sliding, in every step of it. A grid robot stays in its cell under
+    ``stop`` and ``slide``.
     """
     goal_radius_m: float = 0.15
     """A robot arrives when its axle's centre is this close to the goal cell's centre, metres."""
