@@ -29,6 +29,8 @@ from .lidar import Lidar
 from .observation import FeatureVector
 from .random_streams import RandomStreams
 
+MAX_ENVS = 1_000_000
+"""A robot takes some kilobytes: beyond this a batch no longer fits a laptop."""
 OPTIONS = ("start", "goal", "heading_rad", "layout")
 INFO_KEYS = (
     "is_success",
@@ -88,8 +90,8 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         robot: Robot = BURGER,
         autoreset: bool = True,
     ) -> None:
-        if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
-            raise InputError(f"num_envs {num_envs!r} must be a whole number of at least 1")
+        if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or not 1 <= num_envs <= MAX_ENVS:
+            raise InputError(f"num_envs {num_envs!r} must be a whole number from 1 to {MAX_ENVS}")
         if max_episode_steps == -1:  # Gymnasium's word for no limit
             max_episode_steps = None
         if max_episode_steps is not None and max_episode_steps < 1:

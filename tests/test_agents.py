@@ -381,6 +381,16 @@ def test_ppo_refuses_spaces_that_are_no_boxes() -> None:
         PPOAgent(Discrete(5), Discrete(4), PPOConfig())
 
 
+def test_an_untrained_policy_drives_ahead_and_hidden_numbers_must_exist() -> None:
+    from gridnav.agents import PPOAgent, PPOConfig
+
+    seen, told = Box(-1.0, 1.0, (3,), np.float32), Box(-1.0, 1.0, (2,), np.float32)
+    agent = PPOAgent(seen, told, PPOConfig(hidden=(8,), initial_forward=0.7))
+    np.testing.assert_allclose(agent.act(np.zeros((4, 3), np.float32)), np.tile([0.7, 0.0], (4, 1)), atol=1e-6)
+    with pytest.raises(ValueError, match="ignored 3 must be below 3, the observation's length"):
+        PPOAgent(seen, told, PPOConfig(ignored=(1, 3)))
+
+
 class Endings(Reaching):
     """One step in which the four environments go on, terminate, truncate, and do both."""
 

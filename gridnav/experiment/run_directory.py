@@ -242,7 +242,10 @@ def _free_path(name: str) -> Path:
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write a file that is either whole or not there."""
     aside = path.with_name(f".tmp-{path.name}")
-    aside.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    with aside.open("w", encoding="utf-8") as file:
+        file.write(json.dumps(content, indent=2, allow_nan=False) + "\n")
+        file.flush()
+        os.fsync(file.fileno())
     aside.replace(path)
 
 
