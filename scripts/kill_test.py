@@ -131,6 +131,7 @@ def hashes(run: Path) -> dict[str, str]:
 
 COST = """
 import sys, time
+start = time.perf_counter()
 from gridnav import cli
 from gridnav.experiment import checkpoint
 from gridnav.experiment.training import Workshop
@@ -145,23 +146,28 @@ def timed(*arguments):
     finally:
         spent += time.perf_counter() - began
 
-def whole(*arguments, **options):
-    began = time.perf_counter()
-    try:  # an interrupt ends it
+def tell():
+    print("COST", spent, time.perf_counter() - start, flush=True)
+
+def learnt(*arguments, **options):
+    try:
         return learn(*arguments, **options)
-    finally:
-        print("COST", spent, time.perf_counter() - began, flush=True)
+    finally:  # an interrupt ends the process soon after
+        tell()
 
 for module in [*sys.modules.values()]:  # wherever it was imported to
     if getattr(module, "save_checkpoint", None) is save:
         module.save_checkpoint = timed
-Workshop.train = whole
-cli.main(sys.argv[1:])
+Workshop.train = learnt
+try:
+    cli.main(sys.argv[1:])
+finally:
+    tell()
 """
 
 
 def cost(agent: str, folder: Path, seconds: float) -> str:
-    """Share of a training's time that its checkpoints take, as a user trains: default agent, layout and period."""
+    """Share of a run's time that its checkpoints take, as a user trains: default agent, layout and period."""
     process = subprocess.Popen(
         [sys.executable, "-c", COST, "train", "--agent", agent, "--budget", "full", "--run-dir", str(folder / "cost")],
         stdout=subprocess.PIPE,
@@ -170,14 +176,14 @@ def cost(agent: str, folder: Path, seconds: float) -> str:
     )
     if not wait(process, lambda: newest(folder / "cost")):  # type: ignore[arg-type]
         sys.exit(f"training {agent} ended before its first checkpoint: {process.communicate()[1]}")
-    # An interrupt ends training; where it is over sooner, its evaluation is not part of the time.
+    # An interrupt ends the training; where it is over sooner, the run ends by itself.
     try:
         told = process.communicate(timeout=seconds)[0]
     except subprocess.TimeoutExpired:
         process.send_signal(signal.SIGINT)
         told = process.communicate()[0]
-    spent, took = next(line for line in told.splitlines() if "COST" in line).split()[1:]
-    return f"{float(spent) / float(took):.2%} of {float(took):.0f} s"
+    spent, took = [float(word) for word in [line for line in told.splitlines() if "COST" in line][-1].split()[1:]]
+    return f"{spent / took:.2%} of {took:.0f} s"
 
 
 def measure(agent: str, options: argparse.Namespace, folder: Path) -> str:
