@@ -4,7 +4,7 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-run=$(mktemp -d)/ladder
+run=runs/ladder  # the picture shows the path: no folder of this machine, and not there yet
 python3 start.py ladder --run-dir "$run" --seed 0
 mkdir -p docs
 python3 start.py view "$run" --screenshot docs/ladder.png
