@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Makes the pictures of the README from a real run: a full ladder, about six minutes on two cores.
+# Makes the pictures of the README from a real run: a full ladder, about three minutes on two cores.
 # Needs a Vulkan driver (apt-get install mesa-vulkan-drivers) for the recording's picture.
 set -euo pipefail
 cd "$(dirname "$0")/.."
