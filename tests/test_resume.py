@@ -45,8 +45,11 @@ CHANGES = {
     "dqn": {
         "num_envs": "16", "steps": "8000", "hidden": "[16]", "batch_size": "32", "replay_size": "500", "warm_up": "100",
     },
-    # 1,280 steps in 20 rollouts.
-    "ppo": {"num_envs": "8", "steps": "6400", "hidden": "[16]", "n_steps": "8", "batch_size": "32"},
+    # 1,280 steps in 20 rollouts; four policies are judged, after rollouts 17, 18, 19 and 20.
+    "ppo": {
+        "num_envs": "8", "steps": "6400", "hidden": "[16]", "n_steps": "8", "batch_size": "32", "n_validations": "20",
+        "validation_episodes": "4",
+    },
 }  # fmt: skip
 
 CRASHES = {"q-learning": (3, 1, 7), "dqn": (3, 1, 7), "ppo": (2,) * 19}
@@ -147,7 +150,8 @@ def test_a_training_that_breaks_off_goes_on_bit_for_bit(kind: AgentKind, tmp_pat
     assert fingerprint(run) == expected
     # By hand: two checkpoints are kept, the finished agent and the last cut before it.
     parts = {name.split("/")[2] for name in expected if name.startswith("checkpoints/")}
-    assert parts == {f"{p}.{end}" for p in ("agent", "training", "worlds", "visits") for end in ("json", "safetensors")}
+    wanted = ["agent", "training", "worlds", "visits", *(["validation"] if kind == "ppo" else [])]
+    assert parts == {f"{part}.{end}" for part in wanted for end in ("json", "safetensors")}
     assert len({name.split("/")[1] for name in expected if name.startswith("checkpoints/")}) == 2
     assert rows == expected_rows
     # Without robots at walls when it broke off, little would be proven about the engine's state.

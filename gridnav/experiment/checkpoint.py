@@ -71,6 +71,8 @@ class Checkpoint:
     """The same of the environments."""
     visits: IntArray | None = None
     """How often a robot was seen in each cell, shape ``(n_rows, n_cols)``."""
+    validation: State | None = None
+    """The best policy so far, where policies of the training are judged."""
 
 
 def save_checkpoint(directory: Path, name: str, checkpoint: Checkpoint) -> Path:
@@ -115,7 +117,13 @@ def save_agent(agent: Agent, directory: Path, step: int, *, name: str) -> Path:
 def _write(aside: Path, name: str, checkpoint: Checkpoint) -> None:
     checkpoint.agent.save(aside)
     visits = None if checkpoint.visits is None else State({"visits": checkpoint.visits}, {})
-    for part, state in (("training", checkpoint.training), ("worlds", checkpoint.worlds), ("visits", visits)):
+    parts = {
+        "training": checkpoint.training,
+        "worlds": checkpoint.worlds,
+        "visits": visits,
+        "validation": checkpoint.validation,
+    }
+    for part, state in parts.items():
         if state is not None:
             write_state(state, aside, part)
     manifest = {
@@ -172,12 +180,12 @@ def _load(path: Path) -> Checkpoint:
     manifest = _manifest(path)
     try:
         agent = _agent_class(manifest["kind"]).load(path)
-        training, worlds, visits = (
+        training, worlds, visits, validation = (
             read_state(path, part) if f"{part}.json" in manifest["parts"] else None
-            for part in ("training", "worlds", "visits")
+            for part in ("training", "worlds", "visits", "validation")
         )
         standing = Standing(**manifest["standing"])
-        return Checkpoint(agent, standing, training, worlds, visits.arrays["visits"] if visits else None)
+        return Checkpoint(agent, standing, training, worlds, visits.arrays["visits"] if visits else None, validation)
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         reason = " ".join(str(error).split())  # torch's have many lines
         raise InputError(f"checkpoint {str(path)!r} cannot be used: {reason:.150}") from error

@@ -14,6 +14,7 @@ from gridnav.agents import Agent, OnProgress, Progress
 from gridnav.envs import LayoutMix, NavigationVectorEnv
 from gridnav.experiment.checkpoint import Checkpoint, Standing, save_checkpoint
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
+from gridnav.experiment.validation import Validation
 from gridnav.problem.types import InputError, IntArray, State
 
 CHECKPOINT_S = 10.0
@@ -29,8 +30,9 @@ class Course:
 
     Args:
         name: Series of the metrics and name of the checkpoints.
-        agent: Who learns.
+        agent: Who learns; afterwards who is kept.
         worlds: Where.
+        validation: Judges its policies; without it the last one is kept.
         before: Where the run stands.
         saved: The checkpoint that is continued, if one is.
         run: Where checkpoints go.
@@ -44,6 +46,7 @@ class Course:
         name: str,
         agent: Agent,
         worlds: NavigationVectorEnv | LayoutMix,
+        validation: Validation | None,
         before: Standing,
         saved: Checkpoint | None,
         run: RunDirectory,
@@ -51,7 +54,7 @@ class Course:
         report: OnProgress,
         checkpoint_s: float,
     ) -> None:
-        self._name, self._agent, self._worlds = name, agent, worlds
+        self._name, self.agent, self._worlds, self._validation = name, agent, worlds, validation
         self._before, self._saved = before, saved
         self._run, self._log, self._report = run, log, report
         self._clock, self._interruption = Clock(checkpoint_s), Interruption()
@@ -76,7 +79,7 @@ class Course:
         resume = None if self._saved is None else self._saved.training
         with self._interruption:
             try:
-                self._agent.learn(
+                self.agent.learn(
                     self._worlds, steps=steps, on_progress=self._on_progress, on_cut=self._on_cut, resume=resume
                 )
             except UNFIT as error:
@@ -85,6 +88,9 @@ class Course:
                     raise
                 words = f"the checkpoint of {self._name!r} does not fit its training: {error!r:.100}"
                 raise InputError(words) from error
+            if self._validation is not None:
+                self._judge(self._validation)
+                self.agent = self._validation.best()
             end = self._standing(is_finished=True)
             self._save(end, None, None)
             if self._interruption.is_asked:
@@ -105,8 +111,13 @@ class Course:
         if self._interruption.is_asked:
             raise KeyboardInterrupt
         # After the checkpoint, for a continued training comes by here again.
+        if self._validation is not None and self._validation.is_due(self._steps):
+            self._judge(self._validation)
         if self.visits is not None and isinstance(self._worlds, NavigationVectorEnv):
             np.add.at(self.visits, tuple(self._worlds.cells.T), 1)
+
+    def _judge(self, validation: Validation) -> None:
+        self._log.add(self._name, self._steps, validation.judge())
 
     def _standing(self, *, is_finished: bool) -> Standing:
         before = self._before
@@ -115,7 +126,8 @@ class Course:
         return Standing(self._steps, seconds, run_steps, self._log.sync(), is_finished)
 
     def _save(self, standing: Standing, training: State | None, worlds: State | None) -> None:
-        checkpoint = Checkpoint(self._agent, standing, training, worlds, self.visits)
+        validation = None if training is None or self._validation is None else self._validation.state()
+        checkpoint = Checkpoint(self.agent, standing, training, worlds, self.visits, validation)
         save_checkpoint(self._run.checkpoints, self._name, checkpoint)
 
 

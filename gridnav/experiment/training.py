@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 from gridnav.agents import Agent, OnProgress, Planner, QLearning
 from gridnav.envs import LayoutMix, NavigationVectorEnv
-from gridnav.experiment.checkpoint import Standing, load_checkpoint
-from gridnav.experiment.course import CHECKPOINT_S, Course, bring_back
+from gridnav.experiment.checkpoint import Checkpoint, Standing, load_checkpoint
+from gridnav.experiment.course import CHECKPOINT_S, UNFIT, Course, bring_back
 from gridnav.experiment.evaluation import evaluate_in
 from gridnav.experiment.presets import choose_config
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
+from gridnav.experiment.validation import Validation
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.metrics import Episode, Summary, summarise
 from gridnav.problem.types import InputError, IntArray
@@ -178,11 +179,14 @@ class Workshop:
         if saved is not None:
             agent, before = saved.agent, saved.standing
             bring_back(worlds, saved, name)
-        course = Course(name, agent, worlds, before, saved, self._run, self._log, report, self._checkpoint_s)
+        validation = make_validation(self.problem, agent, world, steps, self.budget, saved)
+        course = Course(
+            name, agent, worlds, validation, before, saved, self._run, self._log, report, self._checkpoint_s
+        )
         end = course.go(steps)
         worlds.close()
         self._run_steps = end.run_steps
-        return Trained(name, agent, end.steps, end.seconds, world, choice.observation, course.visits)
+        return Trained(name, course.agent, end.steps, end.seconds, world, choice.observation, course.visits)
 
     def evaluate(self, name: str, trained: Trained, world: str, agent: str, *, carried: str = "") -> Result:
         """Fixed-seed episodes of an agent in a world; an agent of the grid drives robots by grid moves.
@@ -247,6 +251,35 @@ def make_learner(
         if isinstance(start, PPOAgent):
             agent.policy.load_state_dict(start.policy.state_dict())
     return agent, worlds, int(agent.planned_steps * budget.share)
+
+
+def make_validation(
+    problem: Problem, agent: Agent, world: str, steps: int, budget: Budget, saved: Checkpoint | None
+) -> Validation | None:
+    """Who judges the policies of a training, where its preset wants that and the budget lasts for two of them.
+
+    In a family of layouts none: a policy is judged in one.
+
+    Args:
+        problem: What is to be solved.
+        agent: Who learns.
+        world: Where.
+        steps: Environment steps of the training.
+        budget: How much may be spent.
+        saved: The checkpoint that is continued, if one is.
+
+    Raises:
+        InputError: When the checkpoint's best policy does not fit.
+    """
+    config: Any = getattr(agent, "config", None)
+    n_policies = round(getattr(config, "n_validations", 0) * budget.share)
+    if n_policies < 2 or problem.family is not None:
+        return None
+    worlds = problem.worlds(world, config.validation_episodes)
+    try:
+        return Validation(agent, worlds, steps, n_policies, saved.validation if saved else None)
+    except UNFIT as error:
+        raise InputError(f"the checkpoint's best policy does not fit its training: {error!r:.100}") from error
 
 
 def check_choice(kinds: Sequence[AgentKind], problem: Problem, world: str, choice: Choice) -> None:
