@@ -4,13 +4,13 @@ import gymnasium as gym
 
 from .diff_drive import DiffDriveEnv, DiffDriveVectorEnv
 from .gl import BACK_ENDS as GL_BACK_ENDS
-from .gl import RenderingError
+from .gl import RenderingError, make_renderer
 from .gl import works as gl_works
 from .grid_moves import GridMoves, MoveDriver
 from .grid_world import GridWorldEnv, GridWorldVectorEnv
 from .layout_mix import LayoutMix
 from .lidar import scan
-from .mjcf import build_spec
+from .mjcf import build_model, build_spec
 from .navigation import NavigationVectorEnv
 from .observation import FeatureVector
 from .single import NavigationEnv
@@ -31,8 +31,10 @@ __all__ = [
     "RenderingError",
     "UnicycleEnv",
     "UnicycleVectorEnv",
+    "build_model",
     "build_spec",
     "gl_works",
+    "make_renderer",
     "scan",
 ]
 

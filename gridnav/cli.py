@@ -12,8 +12,11 @@ import json
 import os
 import re
 import shlex
+import shutil
 import signal
 import sys
+import tempfile
+import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -28,7 +31,8 @@ from rich.table import Table
 from gridnav.agents import OnProgress
 from gridnav.agents import Progress as Learning
 from gridnav.display.figures import save_figure
-from gridnav.display.recording import ViewerError
+from gridnav.display.recording import check_recording
+from gridnav.display.viewer import ViewerError
 from gridnav.envs import RenderingError
 from gridnav.experiment.checkpoint import clear_leftovers
 from gridnav.experiment.course import CHECKPOINT_S
@@ -243,11 +247,33 @@ class Evaluate:
 
 
 @dataclass(frozen=True)
-class View:
-    """Open a run's recording in the Rerun viewer, or draw it into a picture."""
+class _Episodes:
+    """Flags of the commands that show episodes."""
 
-    run: Annotated[Path, tyro.conf.Positional]
-    """A run directory."""
+    rollouts: tuple[str, ...] = ()
+    """Names of evaluated agents, such as ppo-warm; by default the last one of the run."""
+    episode: int | None = None
+    """Number of the episode, from 0."""
+    worst: bool = False
+    """The episode with the lowest return."""
+    failed: bool = False
+    """The first episode that did not reach its goal."""
+
+
+@dataclass(frozen=True)
+class View(_Episodes):
+    """Look at a run, or at several side by side, in the Rerun viewer: a window, a browser or a picture."""
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    """Run directories; several show the same episode side by side."""
+    overlay: bool = False
+    """All episodes at once, in one maze."""
+    web: bool = False
+    """Show it in a browser of this machine, and of no other one, until interrupted."""
+    port: int = 0
+    """Where the browser's page is; a free port by default."""
+    save: Path | None = None
+    """Write the recording to this .rrd file and show nothing."""
     screenshot: Path | None = None
     """Write a picture of the recording to this PNG file; needs no display."""
     time_s: float | None = None
@@ -255,17 +281,134 @@ class View:
 
     def __call__(self) -> int:
         """Run it."""
-        from gridnav.display.recording import open_viewer, screenshot
+        if not self.runs:
+            raise InputError("view needs the folder of at least one run")
+        if sum((self.web, self.save is not None, self.screenshot is not None)) > 1:
+            raise InputError("--web, --save and --screenshot exclude each other: give one of them")
+        if not 0 <= self.port < 65536 or (self.port and not self.web):
+            raise InputError(f"--port {self.port} must be from 0 to 65535, and goes with --web")
+        for flag, file, ending in (("--save", self.save, ".rrd"), ("--screenshot", self.screenshot, ".png")):
+            if file is not None:
+                _check_new_file(flag, file, ending)
+        with tempfile.TemporaryDirectory() as folder:
+            self._show(self._recording(Path(folder)))
+        return 0
 
-        recording = RunDirectory.open(self.run).recording
-        if not recording.is_file():
-            raise InputError(f"{str(self.run)!r} has no {recording.name}: the run has not finished")
-        if self.screenshot is None:
-            open_viewer(recording)
+    def _recording(self, folder: Path) -> Path:
+        """The recording of what was asked for: the run's own one, or a new one."""
+        from gridnav.experiment.viewing import Pick, find_rollouts, record_episode, record_overlay
+
+        runs = [RunDirectory.open(path) for path in self.runs]
+        pick = Pick(self.episode, self.worst, self.failed)
+        if self.overlay and pick.is_given:
+            raise InputError("--overlay shows all episodes: leave --episode, --worst and --failed out")
+        if len(runs) == 1 and not (pick.is_given or self.rollouts or self.overlay):
+            recording = runs[0].recording
+            if not recording.is_file():
+                raise InputError(f"{str(self.runs[0])!r} has no {recording.name}: the run has not finished")
+            check_recording(recording)
+            return recording
+        found = find_rollouts(runs, self.rollouts)
+        recording = folder / "episodes.rrd"
+        if self.overlay:
+            record_overlay(recording, found)
+        else:
+            record_episode(recording, found, pick)
+        return recording
+
+    def _show(self, recording: Path) -> None:
+        from gridnav.display.recording import screenshot
+        from gridnav.display.viewer import open_window, web_viewer
+
+        if self.save is not None:
+            shutil.copyfile(recording, self.save)
+            stdout.print(str(self.save))
+        elif self.screenshot is not None:
+            screenshot(recording, self.screenshot, time_s=self.time_s)
+            stdout.print(str(self.screenshot))
+        elif self.web:
+            with web_viewer(recording, self.port) as (address, has_ended):
+                stdout.print(f"{address}\nopen this in a browser on this machine; Ctrl-C ends it")
+                with contextlib.suppress(KeyboardInterrupt):
+                    while not has_ended():
+                        time.sleep(0.2)
+        else:
+            open_window(recording)
+
+
+@dataclass(frozen=True)
+class Video(_Episodes):
+    """Film an episode of a run in MuJoCo's picture, as .mp4 or .gif; needs no display."""
+
+    run: Annotated[Path, tyro.conf.Positional] = Path()
+    """A run directory."""
+    output: Path = Path("episode.mp4")
+    """The file to write."""
+    camera: Literal["above", "chase", "onboard"] = "above"
+    """From above, from behind the robot, or what the robot would see."""
+    size: tuple[int, int] = (640, 480)
+    """Width and height, pixels."""
+    speed: float = 1.0
+    """Seconds of the episode per second of the film."""
+
+    def __call__(self) -> int:
+        """Run it."""
+        from gridnav.experiment.video import write_video
+        from gridnav.experiment.viewing import Pick, find_rollouts
+
+        _check_new_file("--output", self.output, ".mp4", ".gif")
+        found = find_rollouts([RunDirectory.open(self.run)], self.rollouts)
+        if len(found) > 1:
+            raise InputError(f"a film shows one agent, not {len(found)}: choose one with --rollouts")
+        ((label, rollouts),) = found.items()
+        number = Pick(self.episode, self.worst, self.failed).number(rollouts)
+        episode, layout = rollouts.episodes[number], rollouts.layout_of(number)
+        with Progress(*Progress.get_default_columns(), console=stderr) as bar:
+            task = bar.add_task(f"filming episode {number}", total=None)
+            write_video(
+                self.output, layout, episode, label, camera=self.camera, size=self.size, speed=self.speed,
+                on_frame=lambda done, total: bar.update(task, completed=done, total=total),
+            )  # fmt: skip
+        stdout.print(str(self.output))
+        return 0
+
+
+@dataclass(frozen=True)
+class Play:
+    """Drive by keyboard, see lidar and reward, and keep the drives as a run that view and video show."""
+
+    env: Literal["gridnav/GridWorld-v0", "gridnav/Unicycle-v0", "gridnav/DiffDrive-v0"] = "gridnav/DiffDrive-v0"
+    """Where."""
+    layout: str = "classic"
+    """A named layout, a text file, or a text."""
+    task: str = "default"
+    """Starts, goals and what a collision does: default, any or fragile."""
+    reward: str = "default"
+    """default, fragile (for the task of that name) or seed (the tutorial's)."""
+    seed: int = 0
+    """Of starts, goals and headings."""
+    run_dir: Path | None = None
+    """Where the drives go; runs/<run-id> below the current folder by default."""
+
+    def __call__(self) -> int:
+        """Run it."""
+        from gridnav.experiment.play import play
+        from gridnav.experiment.results import write_drives
+
+        if not 0 <= self.seed < 2**32:
+            raise InputError(f"--seed {self.seed} is outside 0 to 4294967295")
+        if self.run_dir is not None and self.run_dir.exists() and any(self.run_dir.iterdir()):
+            raise InputError(f"run directory {str(self.run_dir)!r} exists and is not empty: name another one")
+        problem = Problem.load(self.layout, self.task, self.reward)
+        world = self.env.split("/")[1].removesuffix("-v0")
+        episodes = play(problem, world, self.seed)
+        if not episodes:
+            stdout.print("nothing was driven, nothing is kept")
             return 0
-        _check_folder("--screenshot", self.screenshot)
-        screenshot(recording, self.screenshot, time_s=self.time_s)
-        stdout.print(str(self.screenshot))
+        layout = self.layout if self.layout in NAMED_LAYOUTS else problem.layout.to_text()
+        config = json.loads(json.dumps(asdict(replace(self, layout=layout, run_dir=None)))) | {"command": "play"}
+        with RunDirectory.create(self.run_dir, "play", config) as run:
+            _show([write_drives(run, problem, world, episodes, self.seed)], run)
         return 0
 
 
@@ -379,6 +522,8 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "train": Train,
     "evaluate": Evaluate,
     "view": View,
+    "video": Video,
+    "play": Play,
     "layout": LayoutCommand,
     "lint-reward": LintReward,
     "doctor": Doctor,
@@ -488,6 +633,12 @@ def _help() -> None:
 def _check_folder(flag: str, file: Path) -> None:
     if not file.parent.is_dir():
         raise InputError(f"{flag} {str(file)!r}: there is no folder {str(file.parent)!r}")
+
+
+def _check_new_file(flag: str, file: Path, *endings: str) -> None:
+    if file.suffix not in endings:
+        raise InputError(f"{flag} {str(file)!r} must end with {' or '.join(endings)}")
+    _check_folder(flag, file)
 
 
 def _home(agent: str) -> str:

@@ -17,8 +17,9 @@ from rerun.chunk import RrdReader
 
 from gridnav.display import palette
 from gridnav.display.figures import trajectories
-from gridnav.display.recording import ViewerError, open_viewer, screenshot, write_recording
+from gridnav.display.recording import screenshot, write_recording
 from gridnav.display.report import Picture, Report, Rung, write_report
+from gridnav.display.viewer import ViewerError, open_window
 from gridnav.problem.layout import Layout
 from gridnav.problem.metrics import Episode, Trace, summarise
 from gridnav.problem.robot import BURGER
@@ -115,10 +116,10 @@ def test_reward_curves_end_at_the_return(tmp_path: Path) -> None:
 
     write_recording(path, CORRIDOR, {"robot": episode})
 
-    assert columns(path, "/return/robot", "SeriesLines:names") == [["goal", "time"]]
+    assert columns(path, "/return/robot", "SeriesLines:names") == [["goal", "time", "sum"]]
     sums = np.array(columns(path, "/return/robot", "Scalars:scalars"))
-    np.testing.assert_allclose(sums, [[0, -0.25], [0, -0.5], [0, -0.75], [10, -1.0]])
-    assert sums[-1].sum() == episode.episode_return
+    np.testing.assert_allclose(sums, [[0, -0.25, -0.25], [0, -0.5, -0.5], [0, -0.75, -0.75], [10, -1.0, 9.0]])
+    assert sums[-1, -1] == episode.episode_return
     assert columns(path, "/return/robot", "step") == [1, 2, 3, 4], "a reward stands at the end of its step"
     assert columns(path, "/action/robot", "step") == [0, 1, 2, 3], "an action stands at the beginning of its step"
 
@@ -221,10 +222,10 @@ def test_without_a_display_the_viewer_names_the_alternatives(tmp_path: Path, mon
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     write_recording(tmp_path / "run.rrd", CORRIDOR, {"robot": drive()})
 
-    with pytest.raises(ViewerError, match=r"gridnav view RUN --screenshot out\.png.*rerun run\.rrd"):
-        open_viewer(tmp_path / "run.rrd")
+    with pytest.raises(ViewerError, match=r"--screenshot out\.png.*--web.*--save out\.rrd"):
+        open_window(tmp_path / "run.rrd")
     with pytest.raises(ViewerError, match="there is no recording"):
-        open_viewer(tmp_path / "other.rrd")
+        open_window(tmp_path / "other.rrd")
 
 
 # ---- The report --------------------------------------------------------------------------------

@@ -1,51 +1,53 @@
-"""Rollouts as a Rerun recording, pictures of it without a display, and the viewer.
+"""Rollouts as a Rerun recording, and pictures of it.
 
-Every call to Rerun in the project is in this file, because its interface changes in most releases.
+Every call to Rerun in the project is in this file, because its interface changes in most releases; ``viewer.py`` has
+the processes. A recording holds rollouts on common timelines, ``sim_time`` in seconds and ``step``. Its entities, with
+``NAME`` a rollout's name:
 
-A recording holds several rollouts of the same maze, start and goal on common timelines, ``sim_time`` in seconds and
-``step``. Its entities, with ``NAME`` a rollout's name:
-
-    /rollouts/NAME/maze, start, goal, trail, collisions   the whole course, at all times
-    /rollouts/NAME/robot, robot/body, robot/heading       where the robot is
+    /rollouts/NAME/maze, start, goal                      the scene
+    /rollouts/NAME/policy/values, arrows                  what the agent makes of the maze, for this goal
+    /rollouts/NAME/distance_field, plan                   shortest ways to the goal, and the one from the start
+    /rollouts/NAME/trail, collisions                      the whole course, at all times
+    /rollouts/NAME/robot, robot/body, heading, wheels     where the robot is
     /rollouts/NAME/robot/lidar/rays, hits                 what it sees, in the lidar's frame
-    /distance_to_goal/NAME, /return/NAME, /action/NAME    curves
+    /return/NAME, /action/NAME, /wheel_speed/NAME,        curves
+    /distance_to_goal/NAME, /state/NAME
     /run_card                                             what this is, in Markdown
 
+An overlay of many episodes has ``/maze``, ``/trails``, ``/robots``, ``/ends`` and ``/distance_to_goal`` instead.
 Data goes in as columns, one call per entity: one call per step is forty times slower.
 """
 
 from __future__ import annotations
 
-import os
-import shutil
-import signal
-import socket
-import subprocess
-import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+import warnings
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import IO, Literal
+from typing import Literal
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from rerun.chunk import RrdReader
 from rerun.experimental import ViewerClient
 
 from gridnav.display import palette
-from gridnav.problem.geodesic import Geodesic
+from gridnav.display.policy_map import PolicyMap
+from gridnav.display.viewer import ViewerError, existing, headless_viewer, wait_until
+from gridnav.problem.geodesic import Geodesic, cell_path
 from gridnav.problem.layout import Layout
 from gridnav.problem.metrics import Episode, Trace
 from gridnav.problem.robot import BURGER, Robot
-from gridnav.problem.types import AnyArray, FloatArray
+from gridnav.problem.types import AnyArray, Cell, FloatArray, InputError
 
 WALL_HEIGHT_M = 0.25
 OUTER_WALL_M = 0.05
 """Thickness at which the outer wall is drawn."""
 LIDAR_HEIGHT_M = 0.182
 """Of the scan plane of a TurtleBot3 Burger above the floor (ROBOTIS-GIT/turtlebot3, ``burger.urdf``)."""
+WHEEL_WIDTH_M = 0.018
+"""Of the robot's tyres (ROBOTIS-GIT/turtlebot3, ``turtlebot3_burger.urdf``)."""
 BODY_HEIGHT_M = 0.192
 """Of the robot (ROBOTIS e-manual, TurtleBot3 specifications)."""
 GRID_BODY_SHARE = 0.5
@@ -53,12 +55,22 @@ GRID_BODY_SHARE = 0.5
 
 NOTES_FADE_S = 5.0
 """The headless viewer's notes about itself are gone four seconds after its start."""
-VIEWER_PATIENCE_S = 60.0
-"""How long the headless viewer may take to start, load and paint."""
-
-
-class ViewerError(RuntimeError):
-    """The Rerun viewer cannot be run here; the message is one line that says what to do."""
+SUM = "#9AA5B1"
+"""Colour of the whole return: seen on a light and on a dark background."""
+FIELD_DOTS = 8
+"""Pixels of the distance field along the side of a cell."""
+STILL_SHARE = 0.05
+"""A robot below this share of its top speed stands, or turns on the spot."""
+STATES = {
+    "driving": palette.BLUE,
+    "turning": palette.SKY,
+    "standing": palette.GRID_LINE,
+    "collided": palette.COLLISION,
+    "arrived": palette.GOAL,
+    "out of time": palette.ORANGE,
+    "physics error": palette.PURPLE,
+}
+"""What a robot is doing, and how an episode ended."""
 
 
 def write_recording(
@@ -66,6 +78,7 @@ def write_recording(
     layout: Layout,
     rollouts: Mapping[str, Episode],
     *,
+    maps: Mapping[str, PolicyMap] | None = None,
     title: str = "gridnav rollout",
     properties: Mapping[str, object] | None = None,
     robot: Robot = BURGER,
@@ -76,6 +89,7 @@ def write_recording(
         path: The file to write; its folder exists.
         layout: The maze.
         rollouts: Name to episode, each with a trace. Grid rollouts have one number per action, robots two.
+        maps: Values and policy of the agents of some rollouts, by the same names, for the floor.
         title: Heading of the run card, and the recording's name in the viewer.
         properties: Seeds, command, versions: shown on the run card and stored with the recording.
         robot: Body and lidar to draw.
@@ -89,34 +103,100 @@ def write_recording(
     ends = {(episode.start, episode.goal) for episode in rollouts.values()}
     if len(ends) > 1:
         raise ValueError(f"the rollouts of a recording share one start and goal, not {sorted(ends)}")
-    shown = {key: str(value) for key, value in (properties or {}).items()}
-    distance = Geodesic(layout, min(robot.radius_m, 0.49 * layout.cell_size_m))
-
-    recording = rr.RecordingStream("gridnav", send_properties=False)
-    recording.save(path, default_blueprint=_blueprint(layout, traces))
-    recording.send_recording_name(title)
-    if shown:
-        recording.send_property("run", rr.AnyValues(drop_untyped_nones=True, **shown))
-    card = rr.TextDocument(_run_card(title, rollouts, shown), media_type=rr.MediaType.MARKDOWN)
-    recording.log("run_card", card, static=True)
     ((start, goal),) = ends
-    for number, (name, trace) in enumerate(traces.items()):
-        _log_scene(recording, _path("rollouts", name), layout, layout.to_metres(np.array([start, goal])))
-        _log_robot(recording, _path("rollouts", name) + "/robot", trace, layout, robot)
-        _log_course(recording, _path("rollouts", name), trace, robot)
+    distance = Geodesic(layout, min(robot.radius_m, 0.49 * layout.cell_size_m))
+    recording = _begin(path, _side_by_side(layout, traces), title, properties, _run_card(title, rollouts, properties))
+    for number, (name, episode) in enumerate(rollouts.items()):
+        trace, here = traces[name], _path("rollouts", name)
+        _log_scene(recording, here, layout, layout.to_metres(np.array([start, goal])))
+        _log_ways(recording, here, trace, layout, distance, goal)
+        if maps and name in maps:
+            _log_policy(recording, f"{here}/policy", layout, maps[name])
+        _log_robot(recording, f"{here}/robot", trace, layout, robot)
+        _log_course(recording, here, trace, robot)
         to_goal = distance.distances(trace.poses[:, :2], np.full(len(trace.poses), distance.goal_number(goal)))
         colour = palette.SERIES[number % len(palette.SERIES)]
         _log_curves(recording, _path("distance_to_goal", name), _times(trace), {name: to_goal}, [colour])
-        _log_reward_and_action(recording, name, trace)
+        _log_reward_and_action(recording, name, trace, robot)
+        _log_states(recording, _path("state", name), episode, trace, robot)
     # Only this writes the footer that readers need.
     recording.disconnect()
+
+
+def write_overlay(
+    path: str | Path,
+    layout: Layout,
+    episodes: Sequence[Episode],
+    *,
+    title: str = "gridnav episodes",
+    properties: Mapping[str, object] | None = None,
+    robot: Robot = BURGER,
+) -> None:
+    """Write many episodes in the same maze to an .rrd file, one above the other.
+
+    Args:
+        path: The file to write; its folder exists.
+        layout: The maze.
+        episodes: Each with a trace; starts and goals may differ.
+        title: Heading of the run card, and the recording's name in the viewer.
+        properties: Seeds, command, versions: shown on the run card and stored with the recording.
+        robot: Body to draw.
+
+    Raises:
+        ValueError: When there is no episode, or one without a trace.
+    """
+    traces = [episode.trace for episode in episodes if episode.trace is not None]
+    if not traces or len(traces) < len(episodes):
+        raise ValueError(f"a recording needs episodes, each with a trace: {len(episodes)} have {len(traces)}")
+    card = _overlay_card(title, episodes, properties)
+    recording = _begin(path, _overlaid(layout), title, properties, card)
+    _log_maze(recording, "/maze", layout)
+    ends = [[layout.to_metres(np.array(cell)) for cell in (one.start, one.goal)] for one in episodes]
+    marks = np.concatenate([np.array(ends), np.full((len(ends), 2, 1), 0.006)], axis=2)
+    for name, points, colour in zip(
+        ("starts", "goals"), marks.swapaxes(0, 1), (palette.START, palette.GOAL), strict=True
+    ):
+        tiles = rr.Points3D(np.unique(points, axis=0), colors=_rgba(colour), radii=0.1)
+        recording.log(f"/ends/{name}", tiles, static=True)
+    for is_success, name in ((True, "arrived"), (False, "missed")):
+        ways = [
+            np.column_stack([trace.poses[:, :2], np.full(len(trace.poses), 0.012)])
+            for trace, episode in zip(traces, episodes, strict=True)
+            if episode.is_success == is_success
+        ]
+        colour = palette.ARRIVED if is_success else palette.MISSED
+        recording.log(f"/trails/{name}", rr.LineStrips3D(ways, colors=_rgba(colour, 170), radii=-1.5), static=True)
+    _log_crowd(recording, layout, episodes, traces, robot)
+    recording.disconnect()
+
+
+def _begin(
+    path: str | Path, blueprint: rrb.Blueprint, title: str, properties: Mapping[str, object] | None, card: str
+) -> rr.RecordingStream:
+    recording = rr.RecordingStream("gridnav", send_properties=False)
+    recording.save(path, default_blueprint=blueprint)
+    recording.send_recording_name(title)
+    if properties:
+        shown = {key: str(value) for key, value in properties.items()}
+        recording.send_property("run", rr.AnyValues(drop_untyped_nones=True, **shown))
+    recording.log("run_card", rr.TextDocument(card, media_type=rr.MediaType.MARKDOWN), static=True)
+    return recording
 
 
 # ---- The scene ---------------------------------------------------------------------------------
 
 
 def _log_scene(recording: rr.RecordingStream, at: str, layout: Layout, ends_w: FloatArray) -> None:
-    """Floor, walls, and the start and goal cells, whose centres are ``ends_w``, shape ``(2, 2)``, metres."""
+    """The maze, and the start and goal cells, whose centres are ``ends_w``, shape ``(2, 2)``, metres."""
+    _log_maze(recording, f"{at}/maze", layout)
+    half = 0.45 * layout.cell_size_m
+    for name, centre, colour in zip(("start", "goal"), ends_w, (palette.START, palette.GOAL), strict=True):
+        tile = np.concatenate([centre - half, centre + half])[None]
+        _log_boxes(recording, f"{at}/{name}", tile, 0.0, 0.004, colour)
+
+
+def _log_maze(recording: rr.RecordingStream, at: str, layout: Layout) -> None:
+    """Floor and walls."""
     (width, height), edge = layout.size_m, OUTER_WALL_M
     outer = [
         (-edge, -edge, width + edge, 0.0),
@@ -125,12 +205,8 @@ def _log_scene(recording: rr.RecordingStream, at: str, layout: Layout, ends_w: F
         (width, 0.0, width + edge, height),
     ]
     walls = np.concatenate([layout.wall_rectangles(), outer])
-    _log_boxes(recording, f"{at}/maze/walls", walls, 0.0, WALL_HEIGHT_M, palette.WALL)
-    _log_boxes(recording, f"{at}/maze/floor", np.array([[0, 0, width, height]]), -0.02, 0.0, palette.FLOOR)
-    half = 0.45 * layout.cell_size_m
-    for name, centre, colour in zip(("start", "goal"), ends_w, (palette.START, palette.GOAL), strict=True):
-        tile = np.concatenate([centre - half, centre + half])[None]
-        _log_boxes(recording, f"{at}/{name}", tile, 0.0, 0.004, colour)
+    _log_boxes(recording, f"{at}/walls", walls, 0.0, WALL_HEIGHT_M, palette.WALL)
+    _log_boxes(recording, f"{at}/floor", np.array([[0, 0, width, height]]), -0.02, 0.0, palette.FLOOR)
 
 
 def _log_boxes(
@@ -144,10 +220,66 @@ def _log_boxes(
     recording.log(at, boxes, static=True)
 
 
+def _log_policy(recording: rr.RecordingStream, at: str, layout: Layout, shown: PolicyMap) -> None:
+    """Values as colours on the floor, and an arrow in each cell; at full speed two thirds of a cell long."""
+    _log_floor_map(recording, f"{at}/values", layout, np.where(layout.walls, np.nan, shown.values), 0.002, "Viridis")
+    cells = np.argwhere(np.isfinite(shown.directions_rad) & ~layout.walls)
+    inside = tuple(cells.T)
+    directions = np.column_stack([np.cos(shown.directions_rad[inside]), np.sin(shown.directions_rad[inside])])
+    vectors = directions * layout.cell_size_m * (0.25 + 0.4 * np.clip(shown.speeds[inside], 0, 1))[:, None]
+    origins = layout.to_metres(cells) - vectors / 2
+    flat = [np.column_stack([part, np.full(len(part), height)]) for part, height in ((origins, 0.008), (vectors, 0.0))]
+    arrows = rr.Arrows3D(origins=flat[0], vectors=flat[1], radii=0.02, colors=_rgba("#FFFFFF", 200))
+    recording.log(f"{at}/arrows", arrows, static=True)
+
+
+def _log_floor_map(
+    recording: rr.RecordingStream, at: str, layout: Layout, values: FloatArray, height_m: float, colormap: str
+) -> None:
+    """Numbers on the floor, row 0 at the top; NaN as the lowest of them."""
+    known = values[np.isfinite(values)]
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    share = (np.nan_to_num(values, nan=low) - low) / max(high - low, 1e-9)
+    n_rows, n_cols = values.shape
+    colormap_of = {"Viridis": rr.components.Colormap.Viridis, "Magma": rr.components.Colormap.Magma}
+    grid = rr.GridMap(
+        data=np.round(255 * share).astype(np.uint8).tobytes(),
+        format=rr.components.ImageFormat(width=n_cols, height=n_rows, color_model="L", channel_datatype="U8"),
+        cell_size=layout.size_m[0] / n_cols,
+        translation=[0.0, 0.0, height_m],
+        colormap=colormap_of[colormap],
+    )
+    recording.log(at, grid, static=True)
+
+
+def _log_ways(
+    recording: rr.RecordingStream, at: str, trace: Trace, layout: Layout, distance: Geodesic, goal: Cell
+) -> None:
+    """The shortest way from the start, by cells or any-angle; and how far the goal is from everywhere, if asked for."""
+    start = trace.poses[0, :2]
+    if trace.is_on_grid:
+        cells = cell_path(layout, tuple(layout.to_cell(start[None])[0].tolist()), goal)
+        points = layout.to_metres(np.array(cells))
+    else:
+        points = distance.path(start, goal)
+    plan = np.column_stack([points, np.full(len(points), 0.02)])
+    recording.log(f"{at}/plan", rr.LineStrips3D([plan], colors=_rgba(palette.PURPLE), radii=-1.5), static=True)
+    dots = np.stack(
+        np.meshgrid(
+            (np.arange(layout.n_cols * FIELD_DOTS) + 0.5) * layout.cell_size_m / FIELD_DOTS,
+            layout.size_m[1] - (np.arange(layout.n_rows * FIELD_DOTS) + 0.5) * layout.cell_size_m / FIELD_DOTS,
+        ),
+        axis=-1,
+    )
+    far = distance.distances(dots.reshape(-1, 2), np.full(dots.size // 2, distance.goal_number(goal)))
+    field = np.where(np.isfinite(far), far, np.nan).reshape(dots.shape[:2])
+    _log_floor_map(recording, f"{at}/distance_field", layout, -field, 0.001, "Magma")
+
+
 def _log_robot(recording: rr.RecordingStream, at: str, trace: Trace, layout: Layout, robot: Robot) -> None:
     """The moving body, red in a collision, and what its lidar sees."""
     zero = np.zeros(len(trace.poses))
-    half_turn = zero if _is_grid(trace) else trace.poses[:, 2] / 2  # a grid robot has no front
+    half_turn = zero if trace.is_on_grid else trace.poses[:, 2] / 2  # a grid robot has no front
     turns = np.column_stack([zero, zero, np.sin(half_turn), np.cos(half_turn)])  # x, y, z, w
     places = np.column_stack([trace.poses[:, :2], zero])
     _send(recording, at, _times(trace), rr.Transform3D.columns(translation=places, quaternion=turns))
@@ -155,14 +287,18 @@ def _log_robot(recording: rr.RecordingStream, at: str, trace: Trace, layout: Lay
     hit = np.concatenate([[False], trace.hits > 0])[:, None]
     colours = np.where(hit, _rgba(palette.COLLISION), _rgba(palette.INK))
     body = f"{at}/body"
-    if _is_grid(trace):
+    if trace.is_on_grid:
         half = GRID_BODY_SHARE * layout.cell_size_m / 2
         box = rr.Boxes3D(half_sizes=[half, half, half / 2], centers=[0, 0, half / 2], fill_mode="solid")
         recording.log(body, box, static=True)
         _send(recording, body, _times(trace), rr.Boxes3D.columns(colors=colours))
         return
+    clear = 2 * robot.wheel_radius_m  # the wheels stand out below
     cylinder = rr.Cylinders3D(
-        lengths=[BODY_HEIGHT_M], radii=[robot.radius_m], centers=[0, 0, BODY_HEIGHT_M / 2], fill_mode="solid"
+        lengths=[BODY_HEIGHT_M - clear],
+        radii=[robot.radius_m],
+        centers=[0, 0, (BODY_HEIGHT_M + clear) / 2],
+        fill_mode="solid",
     )
     recording.log(body, cylinder, static=True)
     _send(recording, body, _times(trace), rr.Cylinders3D.columns(colors=colours))
@@ -173,7 +309,39 @@ def _log_robot(recording: rr.RecordingStream, at: str, trace: Trace, layout: Lay
         colors=_rgba(palette.ORANGE),
     )
     recording.log(f"{at}/heading", arrow, static=True)
+    _log_wheels(recording, f"{at}/wheels", trace, robot)
     _log_lidar(recording, f"{at}/lidar", trace, robot)
+
+
+def _log_wheels(recording: rr.RecordingStream, at: str, trace: Trace, robot: Robot) -> None:
+    """Two wheels that roll as far as the robot went, with a mark on each."""
+    rolled = np.concatenate(
+        [np.zeros((1, 2)), np.cumsum(_wheel_speeds(trace, robot) * np.diff(trace.time_s)[:, None], 0)]
+    )
+    for number, (name, side) in enumerate((("left", 1), ("right", -1))):
+        # A cylinder stands upright: laid along the axle, y, and then rolled about it.
+        half = rolled[:, number] / 2
+        turns = np.column_stack([np.cos(half), np.sin(half), -np.sin(half), np.cos(half)]) / np.sqrt(2)
+        here = np.tile([0.0, side * robot.wheel_separation_m / 2, robot.wheel_radius_m], (len(half), 1))
+        tyre = rr.Cylinders3D(
+            lengths=[WHEEL_WIDTH_M], radii=[robot.wheel_radius_m], colors=_rgba(palette.WALL), fill_mode="solid"
+        )
+        spoke = [0.9 * robot.wheel_radius_m, 0.15 * robot.wheel_radius_m, 0.51 * WHEEL_WIDTH_M]
+        recording.log(f"{at}/{name}/tyre", tyre, static=True)
+        mark = rr.Boxes3D(half_sizes=[spoke], colors=_rgba(palette.FLOOR), fill_mode="solid")
+        recording.log(f"{at}/{name}/mark", mark, static=True)
+        _send(recording, f"{at}/{name}", _times(trace), rr.Transform3D.columns(translation=here, quaternion=turns))
+
+
+def _wheel_speeds(trace: Trace, robot: Robot) -> FloatArray:
+    """Left and right, rad/s, that give the motion of each step if nothing slips, shape ``(t, 2)``."""
+    step_s = np.diff(trace.time_s)
+    heading = np.unwrap(trace.poses[:, 2])
+    middle = (heading[1:] + heading[:-1]) / 2
+    forward = (np.diff(trace.poses[:, :2], axis=0) * np.column_stack([np.cos(middle), np.sin(middle)])).sum(axis=1)
+    turn = np.diff(heading) * robot.wheel_separation_m / 2
+    # Diverged physics leaves a pose that is no number.
+    return np.nan_to_num(np.column_stack([forward - turn, forward + turn]) / robot.wheel_radius_m / step_s[:, None])
 
 
 def _log_lidar(recording: rr.RecordingStream, at: str, trace: Trace, robot: Robot) -> None:
@@ -213,13 +381,62 @@ def _log_course(recording: rr.RecordingStream, at: str, trace: Trace, robot: Rob
 # ---- Curves and text ---------------------------------------------------------------------------
 
 
-def _log_reward_and_action(recording: rr.RecordingStream, name: str, trace: Trace) -> None:
+def _log_crowd(
+    recording: rr.RecordingStream, layout: Layout, episodes: Sequence[Episode], traces: Sequence[Trace], robot: Robot
+) -> None:
+    """All robots at once as discs, each until its end, where it stays."""
+    longest = max(traces, key=lambda trace: float(trace.time_s[-1]))
+    steps = np.arange(len(longest.time_s))
+    at = np.stack([trace.poses[np.minimum(steps, len(trace.poses) - 1), :2] for trace in traces], axis=1)
+    points = np.concatenate([at, np.full((*at.shape[:2], 1), 0.03)], axis=2).astype(np.float32)
+    colours = np.array([_rgba(palette.ARRIVED if one.is_success else palette.MISSED) for one in episodes])
+    radius = GRID_BODY_SHARE * layout.cell_size_m / 2 if longest.is_on_grid else robot.radius_m
+    recording.log("/robots", rr.Points3D.from_fields(colors=colours, radii=[radius]), static=True)
+    columns = rr.Points3D.columns(positions=points.reshape(-1, 3)).partition(np.full(len(steps), len(traces)))
+    _send(recording, "/robots", _times(longest), columns)
+    arrived = np.array(
+        [[one.is_success and n >= len(t.actions) for n in steps] for one, t in zip(episodes, traces, strict=True)]
+    )
+    _log_curves(recording, "/arrived", _times(longest), {"arrived": arrived.mean(axis=0)}, [palette.ARRIVED])
+
+
+def _log_states(recording: rr.RecordingStream, at: str, episode: Episode, trace: Trace, robot: Robot) -> None:
+    """What the robot is doing, wherever that changes, and how the episode ended."""
+    states = _states(trace, robot)
+    ended = "arrived" if episode.is_success else "physics error" if episode.physics_error else "out of time"
+    names = [*states, ended]
+    changes = [i for i in range(len(names)) if i == 0 or names[i] != names[i - 1]]
+    style = rr.StateConfiguration(values=list(STATES), labels=list(STATES), colors=[_rgba(c) for c in STATES.values()])
+    recording.log(at, style, static=True)
+    times = [
+        rr.TimeColumn("sim_time", duration=trace.time_s[changes]),
+        rr.TimeColumn("step", sequence=np.array(changes)),
+    ]
+    _send(recording, at, times, rr.StateChange.columns(state=[names[i] for i in changes]))
+
+
+def _states(trace: Trace, robot: Robot) -> list[str]:
+    """One word for each step."""
+    step_s = np.diff(trace.time_s)
+    speed = np.linalg.norm(np.diff(trace.poses[:, :2], axis=0), axis=1) / step_s
+    turn = np.abs(np.diff(np.unwrap(trace.poses[:, 2]))) / step_s
+    kinds = [trace.hits > 0, speed > STILL_SHARE * robot.max_speed_m_s, turn > STILL_SHARE * robot.max_turn_rad_s]
+    return list(np.select(kinds, ["collided", "driving", "turning"], "standing"))
+
+
+def _log_reward_and_action(recording: rr.RecordingStream, name: str, trace: Trace, robot: Robot) -> None:
     """The return by terms, summed up to each step's end; actions from their step's beginning to its end."""
     colours = palette.SERIES
     # One step's progress would be invisible beside the reward at the goal; sums are of one size.
     earned = {term: np.cumsum(values) for term, values in trace.reward_terms.items()}
-    _log_curves(recording, _path("return", name), _times(trace, slice(1, None)), earned, colours)
-    commands = ["move"] if _is_grid(trace) else ["forward", "turn"]
+    shades = [palette.REWARD_TERMS.get(term, colours[i % len(colours)]) for i, term in enumerate(earned)]
+    total = {"sum": np.sum(list(earned.values()), axis=0)}
+    _log_curves(recording, _path("return", name), _times(trace, slice(1, None)), earned | total, [*shades, SUM])
+    if not trace.is_on_grid:
+        rolled = dict(zip(("left", "right"), _wheel_speeds(trace, robot).T, strict=True))
+        at = _path("wheel_speed", name)
+        _log_curves(recording, at, _times(trace, slice(None, -1)), rolled, colours, interpolation="StepAfter")
+    commands = ["move"] if trace.is_on_grid else ["forward", "turn"]
     actions = dict(zip(commands, trace.actions.T, strict=True))
     _log_curves(
         recording, _path("action", name), _times(trace, slice(None, -1)), actions, colours, interpolation="StepAfter"
@@ -247,7 +464,7 @@ def _log_curves(
     _send(recording, at, times, rr.Scalars.columns(scalars=values.ravel()).partition(np.full(len(values), n)))
 
 
-def _run_card(title: str, rollouts: Mapping[str, Episode], properties: Mapping[str, str]) -> str:
+def _run_card(title: str, rollouts: Mapping[str, Episode], properties: Mapping[str, object] | None) -> str:
     """What the recording shows, in Markdown."""
     first = next(iter(rollouts.values()))
     lines = [
@@ -263,9 +480,25 @@ def _run_card(title: str, rollouts: Mapping[str, Episode], properties: Mapping[s
             f"| {episode.path_length_m:.2f} | {episode.shortest_path_m:.2f} | {episode.elapsed_s:.1f} "
             f"| {episode.collisions} | {episode.episode_return:.2f} |"
         )
-    lines += ["", "Trail: orange is slow, blue is full speed. Red: collisions.", ""]
-    lines += [f"- {_plain(key)}: {_plain(value)}" for key, value in properties.items()]
-    return "\n".join(lines)
+    lines += ["", "Trail: orange is slow, blue is full speed. Red: collisions. Purple: the shortest way.", ""]
+    return "\n".join(lines + _facts(properties))
+
+
+def _overlay_card(title: str, episodes: Sequence[Episode], properties: Mapping[str, object] | None) -> str:
+    """What the overlay shows, in Markdown: how many arrived, and which did not."""
+    arrived = sum(one.is_success for one in episodes)
+    touched = sum(one.collisions > 0 for one in episodes)
+    lines = [
+        f"# {_plain(title)}",
+        f"{len(episodes)} episodes: {arrived} arrived (blue), {len(episodes) - arrived} did not (red), "
+        f"{touched} touched a wall.",
+        "",
+    ]
+    return "\n".join(lines + _facts(properties))
+
+
+def _facts(properties: Mapping[str, object] | None) -> list[str]:
+    return [f"- {_plain(key)}: {_plain(str(value))}" for key, value in (properties or {}).items()]
 
 
 def _plain(text: str) -> str:
@@ -276,25 +509,35 @@ def _plain(text: str) -> str:
 # ---- The arrangement ---------------------------------------------------------------------------
 
 
-def _blueprint(layout: Layout, traces: Mapping[str, Trace]) -> rrb.Blueprint:
+def _side_by_side(layout: Layout, traces: Mapping[str, Trace]) -> rrb.Blueprint:
     """The mazes side by side, each with its curves below; on the right what they share."""
     mazes = [
         rrb.Spatial3DView(
             name=name,
             origin=_path("rollouts", name),
+            # There for those who ask: it would hide the values.
+            overrides={_path("rollouts", name, "distance_field"): rrb.EntityBehavior(visible=False)},
             eye_controls=_eye(layout, len(traces)),
             background=[255, 255, 255],
             line_grid=False,
         )
         for name in traces
     ]
-    rewards = [
-        _curve_view(f"{name}: reward so far", _path("return", name), rrb.PlotLegend(rrb.Corner2D.LeftTop))
-        for name in traces
-    ]
+    legend = rrb.PlotLegend(rrb.Corner2D.LeftTop)
+    rewards = [_curve_view(f"{name}: reward so far", _path("return", name), legend) for name in traces]
     # A legend would cover these low plots: their titles say it.
+    none = rrb.PlotLegend(visible=False)
     actions = [
-        _curve_view(f"{name}: {_action_words(trace)}", _path("action", name), rrb.PlotLegend(visible=False))
+        rrb.Tabs(
+            _curve_view(_action_words(name, trace), _path("action", name), none),
+            *(
+                []
+                if trace.is_on_grid
+                else [
+                    _curve_view("wheels, rad/s: left (blue), right (orange)", _path("wheel_speed", name), none),
+                ]
+            ),
+        )
         for name, trace in traces.items()
     ]
     rows = [rrb.Horizontal(*views) for views in (mazes, rewards, actions)]
@@ -302,13 +545,28 @@ def _blueprint(layout: Layout, traces: Mapping[str, Trace]) -> rrb.Blueprint:
     shared = [
         rrb.TextDocumentView(name="Run", origin="/run_card"),
         _curve_view("Shortest way to the goal (m)", "/distance_to_goal", to_goal),
+        rrb.StateTimelineView(name="What it does", origin="/state"),
     ]
+    return _arranged(
+        rrb.Vertical(*rows, row_shares=[10, 6, 4]), rrb.Vertical(*shared, row_shares=[5, 5, 3]), max(len(traces), 2)
+    )
+
+
+def _overlaid(layout: Layout) -> rrb.Blueprint:
+    """One maze with everybody in it; on the right what became of them."""
+    maze = rrb.Spatial3DView(
+        name="Episodes", origin="/", eye_controls=_eye(layout, 1), background=[255, 255, 255], line_grid=False
+    )
+    shared = [
+        rrb.TextDocumentView(name="Run", origin="/run_card"),
+        _curve_view("Share that has arrived", "/arrived", rrb.PlotLegend(visible=False)),
+    ]
+    return _arranged(maze, rrb.Vertical(*shared, row_shares=[1, 1]), 2)
+
+
+def _arranged(main: rrb.Container | rrb.View, side: rrb.Container, main_share: int) -> rrb.Blueprint:
     return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Vertical(*rows, row_shares=[10, 6, 4]),
-            rrb.Vertical(*shared, row_shares=[1, 1]),
-            column_shares=[max(len(traces), 2), 1],
-        ),
+        rrb.Horizontal(main, side, column_shares=[main_share, 1]),
         rrb.TimePanel(state="collapsed", timeline="sim_time"),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
@@ -320,8 +578,8 @@ def _curve_view(name: str, origin: str, legend: rrb.PlotLegend) -> rrb.TimeSerie
     return rrb.TimeSeriesView(name=name, origin=origin, plot_legend=legend)
 
 
-def _action_words(trace: Trace) -> str:
-    return "up 0, down 1, left 2, right 3" if _is_grid(trace) else "forward (blue), turn (orange)"
+def _action_words(name: str, trace: Trace) -> str:
+    return f"{name}: " + ("up 0, down 1, left 2, right 3" if trace.is_on_grid else "forward (blue), turn (orange)")
 
 
 def _eye(layout: Layout, n_views: int) -> rrb.EyeControls3D:
@@ -334,10 +592,6 @@ def _eye(layout: Layout, n_views: int) -> rrb.EyeControls3D:
 
 
 # ---- Small parts -------------------------------------------------------------------------------
-
-
-def _is_grid(trace: Trace) -> bool:
-    return bool(trace.actions.shape[1] == 1)
 
 
 def _times(trace: Trace, part: slice = slice(None)) -> list[rr.TimeColumn]:
@@ -360,25 +614,22 @@ def _rgba(colour: str, alpha: int = 255) -> AnyArray:
     return np.array([*bytes.fromhex(colour[1:]), alpha], dtype=np.uint8)
 
 
-# ---- Looking at a recording --------------------------------------------------------------------
+# ---- Pictures of a recording -------------------------------------------------------------------
 
 
-def open_viewer(recording_path: str | Path) -> None:
-    """Show a recording in the Rerun viewer; returns when its window is closed.
+def check_recording(path: Path) -> None:
+    """Whether a file is a whole recording.
 
     Raises:
-        ViewerError: When there is no display, no viewer, or no graphics driver.
+        InputError: When it is none, or cut off.
     """
-    path = _existing(recording_path)
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise ViewerError(
-            "no display here: use `gridnav view RUN --screenshot out.png`, or copy "
-            f"{path.name} to a machine with a display and run `rerun {path.name}` there"
-        )
-    command = [*_viewer_command("auto"), str(path)]
-    done = subprocess.run(command, env=_viewer_environment(), capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        raise _viewer_failure(done.stderr)
+    try:
+        with warnings.catch_warnings(action="error"):  # a file that was cut off has no footer
+            whole = bool(RrdReader(path).recordings())
+    except (ValueError, OSError, RuntimeError, Warning):
+        whole = False
+    if not whole:
+        raise InputError(f"{str(path)!r} is no whole recording: make it again with its run")
 
 
 def screenshot(
@@ -399,10 +650,11 @@ def screenshot(
     Raises:
         ViewerError: When there is no viewer or no graphics driver, or a view reports an error.
     """
-    path = _existing(recording_path)
-    with _headless_viewer(window_size) as client:
+    path = existing(recording_path)
+    with headless_viewer(window_size) as address:
+        client = ViewerClient.connect(address)
         client.open(path.resolve().as_uri())
-        _wait_until(lambda: not client.get_state().loading, "load the recording")
+        wait_until(lambda: not client.get_state().loading, "load the recording")
         if time_s is None:
             time_s = _end_s(client)
         client.set_time("sim_time", duration=time_s, play_state="paused")
@@ -414,66 +666,6 @@ def screenshot(
         if errors:
             raise ViewerError(f"the viewer cannot show {path.name}: {'; '.join(errors)}")
     Path(png_path).write_bytes(picture)
-
-
-@contextmanager
-def _headless_viewer(window_size: tuple[int, int]) -> Iterator[ViewerClient]:
-    """A viewer without a window, that only this machine can reach; its processes end with the block."""
-    port = _free_port()
-    size = "{}x{}".format(*window_size)
-    command = [*_viewer_command(str(port)), "--headless", "--hide-welcome-screen", "--window-size", size]
-    with tempfile.TemporaryFile() as log:
-        # The `rerun` command starts the real viewer as its child: a session of their own ends them together.
-        process = subprocess.Popen(
-            command, env=_viewer_environment(), stdout=log, stderr=log, stdin=subprocess.DEVNULL, start_new_session=True
-        )
-        try:
-            _wait_until(lambda: process.poll() is not None or _is_open(port), "start")
-            if process.poll() is not None:
-                raise _viewer_failure(_text(log))
-            yield ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
-        except ViewerError:
-            raise
-        except (OSError, RuntimeError) as error:
-            # Without a driver the viewer answers first and ends then, and says why.
-            with suppress(subprocess.TimeoutExpired):
-                process.wait(2.0)
-            raise _viewer_failure(str(error) if process.poll() is None else _text(log)) from None
-        finally:
-            _end(process)
-
-
-def _viewer_command(port: str) -> list[str]:
-    """The viewer of this Python environment, else the one on the path; bound to this machine, not to the network."""
-    beside = Path(sys.executable).with_name("rerun.exe" if os.name == "nt" else "rerun")
-    program = str(beside) if beside.exists() else shutil.which("rerun")
-    if program is None:
-        raise ViewerError("no `rerun` program here: install it with `pip install 'rerun-sdk>=0.41,<0.42'`")
-    return [program, "--bind", "127.0.0.1", "--port", port]
-
-
-def _viewer_environment() -> dict[str, str]:
-    # The viewer sends no usage statistics where this says that it runs in continuous integration.
-    return {**os.environ, "CI": "1"}
-
-
-def _viewer_failure(log: str) -> ViewerError:
-    """One line from what the viewer wrote, or from what asking it gave."""
-    if "graphics adapter" in log or "render context" in log:
-        return ViewerError(
-            "the Rerun viewer found no Vulkan driver: install one, for example with "
-            "`apt-get install mesa-vulkan-drivers`, which draws on the processor"
-        )
-    lines = [line.strip() for line in log.splitlines() if line.strip()]
-    telling = [line for line in lines if "panicked at" in line or line.startswith("Error")] or lines[-1:]
-    return ViewerError(f"the Rerun viewer failed: {telling[0] if telling else 'it gave no reason'}")
-
-
-def _existing(recording_path: str | Path) -> Path:
-    path = Path(recording_path)
-    if not path.is_file():
-        raise ViewerError(f"there is no recording {str(path)!r}")
-    return path
 
 
 def _end_s(client: ViewerClient) -> float:
@@ -492,39 +684,5 @@ def _settled_picture(client: ViewerClient) -> bytes:
         before, picture = picture, client.take_screenshot()
         return before == picture and time.monotonic() > faded
 
-    _wait_until(settled, "finish its picture")
+    wait_until(settled, "finish its picture")
     return picture
-
-
-def _wait_until(condition: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + VIEWER_PATIENCE_S
-    while not condition():
-        if time.monotonic() > deadline:
-            raise ViewerError(f"the Rerun viewer did not {what} within {VIEWER_PATIENCE_S:.0f} s")
-        time.sleep(0.05)
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def _is_open(port: int) -> bool:
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) == 0
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """End the process and its children."""
-    if os.name == "nt":
-        subprocess.run(["taskkill", "/PID", str(process.pid), "/T", "/F"], capture_output=True, check=False)
-    else:
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
-
-
-def _text(log: IO[bytes]) -> str:
-    log.seek(0)
-    return log.read().decode(errors="replace")

@@ -28,6 +28,10 @@ Policy = Callable[[NDArray[Any]], NDArray[Any]]
 """Observations of all environments to their actions, a leading batch axis on both."""
 
 
+class PolicyStopped(Exception):  # noqa: N818, no error
+    """A policy, a person for example, does not go on: the episodes end where they are."""
+
+
 def policy_for(agent: Agent, worlds: NavigationVectorEnv) -> Policy:
     """The agent's own actions, or grid moves driven by it where it learnt on the grid and these are robots."""
     on_grid = isinstance(worlds.single_action_space, Discrete)
@@ -71,14 +75,16 @@ def evaluate(
     *,
     seed: int = EVALUATION_SEED,
     on_progress: OnProgress | None = None,
+    on_info: Callable[[dict[str, Any]], None] | None = None,
 ) -> list[Episode]:
     """The first episode of every environment under a policy.
 
     Args:
-        policy: Chooses the actions.
+        policy: Chooses the actions, or raises ``PolicyStopped``.
         worlds: As many environments as episodes are wanted. They need a time limit.
         seed: Gives every environment its start, goal and heading, the same in every world.
         on_progress: Told how many episodes have ended; its steps are episodes.
+        on_info: Given the info of the start and of what each step led to.
 
     Returns:
         One record per environment, with its trace.
@@ -89,20 +95,32 @@ def evaluate(
     observations, info = worlds.reset(seed=seed)
     course = _Course(worlds)
     course.add_state(info)
+    if on_info:
+        on_info(info)
     last: list[dict[str, Any]] = [{} for _ in range(n)]
     running = np.ones(n, dtype=bool)
     while running.any():
-        actions = policy(observations)
+        try:
+            actions = policy(observations)
+        except PolicyStopped:
+            last = [last[i] if not running[i] else _of_one(info, i) for i in range(n)]
+            break
         observations, rewards, terminated, truncated, info = worlds.step(actions)
         course.add_step(actions, rewards, info)
+        if on_info:
+            on_info(info.get("final_info", info))
         for i in np.flatnonzero((terminated | truncated) & running):
-            last[i] = {key: value[i] for key, value in info["final_info"].items() if isinstance(value, np.ndarray)}
+            last[i] = _of_one(info["final_info"], int(i))
             running[i] = False
         if on_progress and "final_info" in info:
             ended = n - int(running.sum())
             arrived = sum(bool(one["is_success"]) for one in last if one)
             on_progress(Progress(ended, n, {"success_rate": arrived / max(ended, 1)}))
     return course.episodes(last)
+
+
+def _of_one(info: dict[str, Any], i: int) -> dict[str, Any]:
+    return {key: value[i] for key, value in info.items() if isinstance(value, np.ndarray)}
 
 
 def evaluate_in(

@@ -11,7 +11,7 @@ from gridnav.experiment.results import (
     report_rows,
     write_evaluation,
     write_page,
-    write_rollout,
+    write_rollouts,
 )
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
 from gridnav.experiment.training import Budget, Choice, OnStage, Result, Trained, Workshop
@@ -88,7 +88,7 @@ def _write(
     best = "ppo-warm" if _success(by_name["ppo-warm"]) >= _success(by_name["ppo-scratch"]) else "ppo-scratch"
     side_by_side = [by_name["q-learning"], by_name["q-table-diffdrive"], by_name[best]]
     properties = {"command": command, "training seed": seed, "run": run.path.name}
-    write_rollout(run, problem, side_by_side, properties)
+    write_rollouts(run, problem, results, side_by_side, properties)
     curves = {
         "ppo-unicycle": "Unicycle, from scratch",
         "ppo-scratch": "DiffDrive, from scratch",

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from gymnasium.spaces import Discrete
 
-from gridnav.agents import Agent, TabularAgent
 from gridnav.display.figures import (
-    command_motion,
     episode_strip,
     learning_curves,
     reward_terms,
@@ -21,21 +17,13 @@ from gridnav.display.figures import (
     visit_counts,
 )
 from gridnav.display.report import Picture
-from gridnav.envs import NavigationVectorEnv
+from gridnav.experiment.policy_maps import N_HEADINGS, policy_maps
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
 from gridnav.experiment.training import Result, Trained
 from gridnav.experiment.worlds import Problem
-from gridnav.problem.geodesic import cell_distances
-from gridnav.problem.layout import Layout
-from gridnav.problem.types import Cell, FloatArray
-
-if TYPE_CHECKING:
-    from gridnav.agents import DQNAgent
 
 DRAWN_EPISODES = 40
 """Ways drawn per panel: more would hide each other and swell the page."""
-N_HEADINGS = 8
-"""Headings at which a robot's network is asked in each cell."""
 
 
 def pictures(
@@ -102,70 +90,20 @@ def _drawn(
 
 def _values(problem: Problem, trained: Trained) -> Picture:
     """What an agent makes of the maze, for the last goal of the task."""
-    layout, goals = problem.layout, problem.task.goal_cells(problem.layout)
-    goal = (int(goals[-1, 0]), int(goals[-1, 1]))
-    worlds = problem.worlds(trained.world, 1, observation=trained.observation)
-    try:
-        if isinstance(worlds.single_action_space, Discrete):
-            moves = _move_values(trained.agent, worlds, layout, len(goals), goal, trained.observation)
-            # The shaping moves values by the distance; without it they grow towards the goal, as a reader expects.
-            distance = cell_distances(layout, goal).ravel()
-            moves = moves + problem.reward.potential(np.where(np.isfinite(distance), distance, 0.0))[:, None]
-            words = f"Values and preferred moves of {trained.name} for the goal at cell {goal}, the shaping taken out."
-            return Picture(value_map(layout, moves, goal), words)
-        values, directions, speeds = _network_values(trained.agent, worlds, goal)
-    finally:
-        worlds.close()
+    cell = problem.task.goal_cells(problem.layout)[-1]
+    goal = (int(cell[0]), int(cell[1]))
+    shown = policy_maps(problem, trained.agent, trained.world, [goal], observation=trained.observation)[goal]
+    if trained.world == "GridWorld":
+        label, arrows = "value (expected discounted reward)", "best move"
+        words = f"Values and preferred moves of {trained.name} for the goal at cell {goal}, the shaping taken out."
+    else:
+        label, arrows = "value (discounted reward)", "where it drives from its best heading"
+        words = (
+            f"What {trained.name}'s value network expects in each cell at rest, mean of {N_HEADINGS} headings, for the "
+            f"goal at cell {goal}, and the way its command takes it in a second."
+        )
     figure = value_map(
-        layout, values, goal, directions_rad=directions, speeds=speeds,
-        label="value (discounted reward)", arrow_label="where it drives from its best heading",
+        problem.layout, shown.values, goal,
+        directions_rad=shown.directions_rad, speeds=shown.speeds, label=label, arrow_label=arrows,
     )  # fmt: skip
-    words = (
-        f"What {trained.name}'s value network expects in each cell at rest, mean of {N_HEADINGS} headings, for the "
-        f"goal at cell {goal}, and the way its command takes it in a second."
-    )
     return Picture(figure, words)
-
-
-def _move_values(
-    agent: Agent, worlds: NavigationVectorEnv, layout: Layout, n_goals: int, goal: Cell, observation: str
-) -> FloatArray:
-    """Values of the four moves in each cell, shape ``(n_cells, 4)``; the goal is the last of the task."""
-    numbers = np.arange(layout.n_cells)
-    if isinstance(agent, TabularAgent):
-        table = agent.action_values
-        return table if observation == "cell" else table.reshape(layout.n_cells, n_goals, 4)[:, -1]
-    if TYPE_CHECKING:
-        assert isinstance(agent, DQNAgent)
-    if observation == "features":
-        cells = np.stack(np.divmod(numbers, layout.n_cols), axis=1)
-        return agent.action_values(_features(worlds, layout.to_metres(cells), 0.0, goal))
-    return agent.action_values(numbers if observation == "cell" else numbers * n_goals + n_goals - 1)
-
-
-def _network_values(agent: Agent, worlds: NavigationVectorEnv, goal: Cell) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Values, directions and speeds of a robot's network in each free cell, shape ``(n_rows, n_cols)`` each."""
-    layout = worlds.layout
-    cells = np.argwhere(~layout.walls)
-    headings = np.arange(N_HEADINGS) * 2 * np.pi / N_HEADINGS
-    observations = [_features(worlds, layout.to_metres(cells), heading, goal) for heading in headings]
-    values = np.stack([agent.values(one) for one in observations])
-    ways, speeds = zip(
-        *(command_motion(agent.act(one), heading) for one, heading in zip(observations, headings, strict=True)),
-        strict=True,
-    )
-    best = values.argmax(axis=0), np.arange(len(cells))
-    maps = []
-    for numbers in (values.mean(axis=0), np.stack(ways)[best], np.stack(speeds)[best]):
-        whole = np.full(layout.walls.shape, np.nan)
-        whole[tuple(cells.T)] = numbers
-        maps.append(whole)
-    return maps[0], maps[1], maps[2]
-
-
-def _features(worlds: NavigationVectorEnv, points_w: FloatArray, heading_rad: float, goal: Cell) -> Any:
-    """What robots at rest at these points observe."""
-    poses = np.column_stack([points_w, np.full(len(points_w), heading_rad)])
-    goals = np.broadcast_to(worlds.layout.to_metres(np.array(goal)), (len(poses), 2))
-    still = np.zeros((len(poses), 2))
-    return worlds.features.observe(poses, worlds.scan(poses), goals, still, still)

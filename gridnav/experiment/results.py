@@ -12,8 +12,9 @@ import numpy as np
 from gridnav.display.recording import write_recording
 from gridnav.display.report import Picture, Report, Rung, write_report
 from gridnav.experiment.checkpoint import LIBRARIES, last_standing, load_agent
-from gridnav.experiment.evaluation import EVALUATION_SEED, evaluate_in
+from gridnav.experiment.evaluation import EVALUATION_SEED, HELD_OUT_LAYOUTS, evaluate_in
 from gridnav.experiment.pictures import pictures
+from gridnav.experiment.rollouts import Rollouts, save_rollouts
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory, read_json, write_json
 from gridnav.experiment.training import AgentKind, Budget, Choice, OnStage, Result, Workshop
 from gridnav.experiment.worlds import Problem
@@ -46,15 +47,50 @@ def evaluation(results: Sequence[Result]) -> dict[str, Any]:
     }
 
 
-def write_rollout(
-    run: RunDirectory, problem: Problem, results: Sequence[Result], properties: Mapping[str, Any]
+def write_rollouts(
+    run: RunDirectory,
+    problem: Problem,
+    results: Sequence[Result],
+    side_by_side: Sequence[Result],
+    properties: Mapping[str, Any],
 ) -> None:
-    """``rollout.rrd``: the same episode of each result side by side, one that all of them finish if there is one."""
-    finished = np.all([[episode.is_success for episode in _here(problem, result)] for result in results], axis=0)
+    """Every episode of each result below ``rollouts/``, and ``rollout.rrd``: one episode side by side.
+
+    Args:
+        run: Where the files go.
+        problem: Gives the layouts.
+        results: Whose episodes are kept.
+        side_by_side: Of which the same episode is shown, one that all of them finish if there is one.
+        properties: Seeds and command, for the recording.
+    """
+    for result in results:
+        save_rollouts(run.rollouts, kept(problem, result))
+    finished = np.all([[one.is_success for one in _here(problem, result)] for result in side_by_side], axis=0)
     # argmax of all False is 0: then the first episode shows who fails.
     number = int(finished.argmax())
-    rollouts = {f"{result.agent} on {result.world}": _here(problem, result)[number] for result in results}
-    write_recording(run.recording, problem.layout, rollouts, title=f"gridnav {run.path.name}", properties=properties)
+    shown = {f"{result.agent} on {result.world}": result for result in side_by_side}
+    rollouts = {name: _here(problem, result)[number] for name, result in shown.items()}
+    maps = {name: result.maps[rollouts[name].goal] for name, result in shown.items() if result.maps}
+    title = f"gridnav {run.path.name}, episode {number}"
+    write_recording(run.recording, problem.layout, rollouts, maps=maps, title=title, properties=properties)
+
+
+def kept(problem: Problem, result: Result) -> Rollouts:
+    """A result's episodes with the layouts they were in."""
+    layouts = {problem.layout.name: problem.layout}
+    if problem.family:
+        layouts = {layout.name: layout for layout in problem.family.held_out(HELD_OUT_LAYOUTS)}
+    seen = {episode.layout for episode in result.episodes}
+    here = {name: layout for name, layout in layouts.items() if name in seen}
+    return Rollouts(result.name, result.world, result.agent, here, result.episodes, result.maps)
+
+
+def write_drives(run: RunDirectory, problem: Problem, world: str, episodes: list[Episode], seed: int) -> Result:
+    """What a person drove, as the evaluation, rollouts, recording and report of a run."""
+    result = Result("drive", world, "a person", "", "", episodes)
+    write_evaluation(run, [result], seed)
+    write_rollouts(run, problem, [result], [result], {"seed": seed})
+    return result
 
 
 def _here(problem: Problem, result: Result) -> list[Episode]:
@@ -141,7 +177,7 @@ def train_and_report(
         trained = [workshop.train(kind, kind, world, choice=choice) for kind in kinds]
         results = [workshop.evaluate(one.name, one, world, one.name) for one in trained]
         write_evaluation(run, results, seed)
-        write_rollout(run, problem, results, {"command": command, "training seed": seed})
+        write_rollouts(run, problem, results, results, {"command": command, "training seed": seed})
         shown = pictures(run, problem, results, trained, {kind: f"{kind} on {world}" for kind in kinds}, log)
     names, many = " and ".join(kinds), len(kinds) > 1
     found = [

@@ -7,7 +7,7 @@ import math
 import os
 import socket
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -38,13 +38,13 @@ class RunInUseError(OSError):
 
 
 class RunDirectory:
-    """``runs/<run-id>/`` with config, metrics, evaluation, report, recording, figures and checkpoints."""
+    """``runs/<run-id>/`` with config, metrics, evaluation, report, recording, rollouts, figures and checkpoints."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.config, self.evaluation = path / CONFIG, path / EVALUATION
         self.report, self.recording = path / REPORT, path / RECORDING
-        self.figures, self.checkpoints = path / "figures", path / "checkpoints"
+        self.figures, self.checkpoints, self.rollouts = path / "figures", path / "checkpoints", path / "rollouts"
         self._lock, self._owner = path / LOCK, path / OWNER
 
     @classmethod
@@ -118,6 +118,12 @@ class RunDirectory:
         if not (path / CONFIG).is_file():
             raise InputError(f"{str(path)!r} is not a run directory: it has no {CONFIG}; give the folder of a run")
         return cls(path)
+
+    def last_rollouts(self, there: Sequence[str]) -> str:
+        """Of the rollouts that are there, those of the last row of the evaluation."""
+        rows = read_json(self.evaluation).get("results", {}) if self.evaluation.is_file() else {}
+        known = [name for name in rows if name in there] if isinstance(rows, dict) else []
+        return known[-1] if known else there[-1]
 
     def read_config(self) -> dict[str, Any]:
         """The config the run was made with.

@@ -8,16 +8,18 @@ from functools import cached_property
 from typing import Any, Literal
 
 from gridnav.agents import Agent, OnProgress, Planner, QLearning
+from gridnav.display.policy_map import PolicyMap
 from gridnav.envs import LayoutMix, NavigationVectorEnv
 from gridnav.experiment.checkpoint import Checkpoint, Standing, load_checkpoint
 from gridnav.experiment.course import CHECKPOINT_S, UNFIT, Course, bring_back
 from gridnav.experiment.evaluation import evaluate_in
+from gridnav.experiment.policy_maps import policy_maps
 from gridnav.experiment.presets import choose_config
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
 from gridnav.experiment.validation import Validation
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.metrics import Episode, Summary, summarise
-from gridnav.problem.types import InputError, IntArray
+from gridnav.problem.types import Cell, InputError, IntArray
 
 AgentKind = Literal["plan", "q-learning", "dqn", "ppo"]
 OBSERVATIONS: dict[AgentKind, tuple[str, ...]] = {
@@ -107,6 +109,8 @@ class Result:
     """Wall-clock time of its own training."""
     observation: str = "cell_goal"
     """What it sees on the grid."""
+    maps: Mapping[Cell, PolicyMap] = field(default_factory=dict)
+    """What the agent makes of the maze, for the goals of the episodes; none in a family of layouts."""
 
     @cached_property
     def summary(self) -> Summary:
@@ -203,9 +207,11 @@ class Workshop:
             self.problem, trained.agent, world, self.budget.episodes,
             observation=trained.observation, on_progress=report,
         )  # fmt: skip
+        goals = [] if self.problem.family else sorted({episode.goal for episode in episodes})
+        maps = policy_maps(self.problem, trained.agent, trained.world, goals, observation=trained.observation)
         own = name == trained.name
         steps, seconds = (trained.steps, trained.seconds) if own else (0, 0.0)
-        return Result(name, world, agent, carried, trained.name, episodes, steps, seconds, trained.observation)
+        return Result(name, world, agent, carried, trained.name, episodes, steps, seconds, trained.observation, maps)
 
 
 def make_learner(

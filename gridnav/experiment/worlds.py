@@ -39,11 +39,17 @@ class Problem:
         return cls(maze, Task.load(task), Reward.load(reward), family)
 
     def worlds(
-        self, world: str, num_envs: int, *, observation: str = "cell_goal", layout: Layout | None = None
+        self,
+        world: str,
+        num_envs: int,
+        *,
+        observation: str = "cell_goal",
+        layout: Layout | None = None,
+        render_mode: str | None = None,
     ) -> NavigationVectorEnv:
         """Robots that play this problem, in its layout or in another one."""
         return make_worlds(
-            world, num_envs, layout=layout or self.layout, task=self.task, reward=self.reward,
+            world, num_envs, layout=layout or self.layout, task=self.task, reward=self.reward, render_mode=render_mode,
             **_grid_options(world, observation),
         )  # fmt: skip
 
