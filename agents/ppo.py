@@ -75,8 +75,9 @@ class PPOConfig:
     """Numbers of the observation that the networks never see, such as ``POSE``, lest they learn a maze by heart."""
     reward_scale: float = 1.0
     """Factor on the rewards the learner sees: it keeps the value network's gradient from crowding out the policy's."""
-    exploring_starts: bool = False
-    """Training episodes start anywhere, and not where the task says."""
+    exploring_starts: float = 0.3
+    """Share of the training episodes that begin anywhere, half of them at a wall, and not where the task says: a policy
+    that explores less and less gets to know fewer and fewer ways to be stuck, and none out of them."""
     target_success: float | None = None
     """Training stops once this share of the last 400 episodes arrived; never before its steps are used up if none."""
 

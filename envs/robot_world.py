@@ -10,7 +10,7 @@ import numba
 import numpy as np
 from gymnasium.spaces import Box
 
-from gridnav.problem.geodesic import Geodesic
+from gridnav.problem.geodesic import Geodesic, clearances
 from gridnav.problem.types import AnyArray, BoolArray, FloatArray, InputError, IntArray
 
 from .navigation import NavigationVectorEnv, as_array
@@ -27,6 +27,10 @@ GRAZING = float(np.sin(np.deg2rad(15.0)))
 Were it stopped at any angle, a robot that brushes a corner would stand still with its way ahead open. Nothing is gained
 by scraping: it is counted and charged as pressing is.
 """
+EXPLORING_DRAWS = 5
+"""Uniform numbers that say whether and where an episode begins anywhere."""
+STAND_OFF_M = 0.003
+"""Gap that a robot which begins at a wall has to it."""
 SAME_WALL = 0.7
 """Cosine of the angle up to which two directions of contact mean one wall: another wall is another collision."""
 
@@ -42,15 +46,22 @@ class RobotVectorEnv(NavigationVectorEnv):
     Args:
         num_envs: Robots in the batch.
         control_period_s: Time between two commands, seconds; 0.2 s is one turn of the lidar (5 Hz).
+        exploring_starts: Share of the episodes that begin anywhere, half of them at a wall, whatever the task says; for
+            training: a robot that is never put there does not learn how to get away from a wall.
         shared: See ``NavigationVectorEnv``.
     """
 
     STATE = (*NavigationVectorEnv.STATE, "contact", "contact_is_inner", "pressed_s", "begins", "presses")
 
-    def __init__(self, num_envs: int = 1, *, control_period_s: float = 0.2, **shared: Any) -> None:
+    def __init__(
+        self, num_envs: int = 1, *, control_period_s: float = 0.2, exploring_starts: float = 0.0, **shared: Any
+    ) -> None:
         if not 0.01 <= control_period_s <= 1.0:
             raise InputError(f"control_period_s {control_period_s} is outside 0.01 to 1 s")
+        if not 0.0 <= exploring_starts <= 1.0:
+            raise InputError(f"exploring_starts {exploring_starts} is outside 0 to 1")
         self.control_period_s = float(control_period_s)
+        self.exploring_starts = float(exploring_starts)
         super().__init__(num_envs, **shared)
 
     @property
@@ -79,11 +90,35 @@ class RobotVectorEnv(NavigationVectorEnv):
         self._begins, self._presses = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
 
     def _place(self, ids: IntArray) -> None:
+        if self.exploring_starts and "start" not in self._fixed:
+            self._explore(ids)
         self._goal_number[ids] = self._geodesic.goal_numbers(self._goal[ids])
         self._contact[ids] = 0.0
         self._pressed_s[ids] = 0.0
         metres = self._geodesic.distances(self._pose[ids], self._goal_number[ids])
         self._transition.next_distance[ids] = metres / self.layout.cell_size_m
+
+    def _explore(self, ids: IntArray) -> None:
+        """Put some of the robots whose episodes begin somewhere else; headings and goals stay."""
+        draws = self._streams.draw(ids, EXPLORING_DRAWS)
+        cells = np.argwhere(self.layout.reachable)
+        # Cell: uniform over those that the starts reach. Place: uniform within it.
+        cells = cells[(draws[:, 1] * len(cells)).astype(np.int64)]
+        # Whether: with the probability asked for, unless the goal is there.
+        moves = (draws[:, 0] < self.exploring_starts) & (cells != self._goal[ids]).any(axis=1)
+        ids, cells, draws = ids[moves], cells[moves], draws[moves]
+        points = self.layout.to_metres(cells) + (draws[:, 2:4] - 0.5) * self.layout.cell_size_m
+        nearest = self.robot.radius_m + STAND_OFF_M
+        # At a wall: one half of them.
+        gap, direction, _ = clearances(points, self.layout)
+        points += np.where(draws[:, 4] < 0.5, gap - nearest, 0.0)[:, None] * direction
+        for _ in range(3):  # off one wall, off the other one in a corner, and off the first again
+            gap, direction, _ = clearances(points, self.layout)
+            points -= np.maximum(nearest - gap, 0.0)[:, None] * direction
+        gap, _, _ = clearances(points, self.layout)
+        fits = (gap >= self.robot.radius_m)[:, None]  # else the cell is narrow, and its middle must do
+        self._start[ids] = self._cell[ids] = np.where(fits, self.layout.to_cell(points), cells)
+        self._pose[ids, :2] = np.where(fits, points, self.layout.to_metres(cells))
 
     def _drive(self, actions: AnyArray) -> None:
         self._roll(actions)

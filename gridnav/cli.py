@@ -54,6 +54,7 @@ from gridnav.problem.types import InputError, NonFiniteError
 
 if TYPE_CHECKING:
     from gridnav.experiment.across_seeds import AcrossSeeds
+    from gridnav.experiment.live import Spectator
 
 Config = TypeVar("Config")
 stderr = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -87,11 +88,21 @@ class _Run:
     """Seconds between two checkpoints of a training; 0 makes one at every opportunity."""
     config: Path | None = None
     """A run's config.json: makes that run again; flags after it change it."""
+    live: bool = False
+    """Show in a Rerun viewer what the agent can do by now, while it learns."""
+    live_s: float = 20.0
+    """Seconds between two episodes of --live, at least; watching takes no more than 2 % of the time."""
+    live_port: int = 0
+    """Port of a Rerun viewer that runs on this machine already; by default --live opens a window."""
 
     def _problem(self) -> tuple[Problem, dict[str, Any]]:
         """The problem, and the configuration as JSON values that need no other file."""
         if not 0 <= self.seed < 2**32:
             raise InputError(f"--seed {self.seed} is outside 0 to 4294967295")
+        if not 0 <= self.live_s <= 86_400:
+            raise InputError(f"--live-s {self.live_s} is outside 0 to 86400 seconds")
+        if not 0 <= self.live_port < 65536:
+            raise InputError(f"--live-port {self.live_port} is outside 0 to 65535")
         if not 0 <= self.checkpoint_s <= 86_400:
             raise InputError(f"--checkpoint-s {self.checkpoint_s} is outside 0 to 86400 seconds")
         problem = Problem.load(self.layout, self.task, self.reward)
@@ -100,6 +111,15 @@ class _Run:
         config = {key: value for key, value in config.items() if key not in OF_ONE_START and value is not None}
         command = {kind: name for name, kind in COMMANDS.items()}[type(self)]
         return problem, json.loads(json.dumps({"command": command, **config}))
+
+    def _spectator(self, problem: Problem) -> Spectator | None:
+        """Who watches, in a viewer that is opened for it or runs already."""
+        if not self.live and not self.live_port:
+            return None
+        from gridnav.display.viewer import address_of, open_empty_window
+        from gridnav.experiment.live import Spectator
+
+        return Spectator(problem, address_of(self.live_port or open_empty_window()), self.live_s)
 
     @contextlib.contextmanager
     def _directory(self, name: str, config: dict[str, Any]) -> Iterator[RunDirectory]:
@@ -139,11 +159,12 @@ class Ladder(_Run):
             raise InputError(
                 "the ladder needs one maze: its plan and its table are of one; train ppo on random layouts"
             )
-        budget = BUDGETS[self.budget]
+        budget, spectator = BUDGETS[self.budget], self._spectator(problem)
         with self._directory("ladder", config) as run, _progress() as on_stage:
             results = climb(
-                problem, budget, self.seed, run, _again(run), config, on_stage, checkpoint_s=self.checkpoint_s
-            )
+                problem, budget, self.seed, run, _again(run), config, on_stage,
+                checkpoint_s=self.checkpoint_s, spectator=spectator,
+            )  # fmt: skip
         _show(results, run)
         return 0
 
@@ -174,11 +195,11 @@ class Train(_Run):
         problem, config = self._problem()
         choice = Choice(self.preset, self._changes(), self.observation)
         check_choice(kinds, problem, world, choice)
-        budget = BUDGETS[self.budget]
+        budget, spectator = BUDGETS[self.budget], self._spectator(problem)
         with self._directory(f"train-{self.agent}", config) as run, _progress() as on_stage:
             results = train_and_report(
                 problem, budget, self.seed, kinds, world, choice, run, _again(run), config, on_stage,
-                checkpoint_s=self.checkpoint_s,
+                checkpoint_s=self.checkpoint_s, spectator=spectator,
             )  # fmt: skip
         _show(results, run)
         return 0
@@ -194,7 +215,10 @@ class Train(_Run):
         return changes
 
 
-OF_ONE_START: dict[str, Any] = {"run_dir": None, "resume": False, "checkpoint_s": CHECKPOINT_S, "config": None}
+OF_ONE_START: dict[str, Any] = {
+    "run_dir": None, "resume": False, "checkpoint_s": CHECKPOINT_S, "config": None, "live": False, "live_s": 20.0,
+    "live_port": 0,
+}  # fmt: skip
 """Flags that are no part of a run's configuration: two starts of one run may differ in them."""
 
 

@@ -23,6 +23,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
@@ -53,6 +54,8 @@ BODY_HEIGHT_M = 0.192
 GRID_BODY_SHARE = 0.5
 """Side of the box that stands for a grid robot, as a share of the cell."""
 
+SEND_PATIENCE_S = 1.0
+"""How long a viewer may take to accept an episode."""
 NOTES_FADE_S = 5.0
 """The headless viewer's notes about itself are gone four seconds after its start."""
 SUM = "#9AA5B1"
@@ -97,18 +100,68 @@ def write_recording(
     Raises:
         ValueError: When there is no rollout, one without a trace, or one with another start or goal.
     """
+    traces = _traces_of(rollouts)
+    card = _run_card(title, rollouts, properties)
+    recording = rr.RecordingStream("gridnav", send_properties=False)
+    recording.save(path, default_blueprint=_side_by_side(layout, traces))
+    _log_head(recording, title, properties, card)
+    _log_rollouts(recording, layout, rollouts, maps, robot)
+    # Only this writes the footer that readers need.
+    recording.disconnect()
+
+
+def send_recording(
+    address: str,
+    layout: Layout,
+    rollouts: Mapping[str, Episode],
+    *,
+    maps: Mapping[str, PolicyMap] | None = None,
+    title: str = "gridnav rollout",
+    robot: Robot = BURGER,
+) -> None:
+    """Send what ``write_recording`` writes to a viewer that runs, as a recording of its own.
+
+    Args:
+        address: The viewer's, ``rerun+http://127.0.0.1:PORT/proxy``. Nothing happens where none answers.
+        layout: The maze.
+        rollouts: See ``write_recording``.
+        maps: See there.
+        title: See there.
+        robot: See there.
+    """
+    recording = rr.RecordingStream("gridnav", send_properties=False)
+    recording.connect_grpc(address)
+    recording.send_blueprint(_side_by_side(layout, _traces_of(rollouts)))
+    _log_head(recording, title, None, _run_card(title, rollouts, None))
+    _log_rollouts(recording, layout, rollouts, maps, robot)
+    # What nobody takes is dropped: a viewer that was closed must not hold training up.
+    with suppress(RuntimeError):
+        recording.flush(timeout_sec=SEND_PATIENCE_S)
+    recording.disconnect()
+
+
+def _traces_of(rollouts: Mapping[str, Episode]) -> dict[str, Trace]:
     traces = {name: episode.trace for name, episode in rollouts.items() if episode.trace is not None}
     if not rollouts or len(traces) < len(rollouts):
         raise ValueError(f"a recording needs rollouts, each with a trace: {list(rollouts)} have {len(traces)}")
     ends = {(episode.start, episode.goal) for episode in rollouts.values()}
     if len(ends) > 1:
         raise ValueError(f"the rollouts of a recording share one start and goal, not {sorted(ends)}")
-    ((start, goal),) = ends
+    return traces
+
+
+def _log_rollouts(
+    recording: rr.RecordingStream,
+    layout: Layout,
+    rollouts: Mapping[str, Episode],
+    maps: Mapping[str, PolicyMap] | None,
+    robot: Robot,
+) -> None:
     distance = Geodesic(layout, min(robot.radius_m, 0.49 * layout.cell_size_m))
-    recording = _begin(path, _side_by_side(layout, traces), title, properties, _run_card(title, rollouts, properties))
     for number, (name, episode) in enumerate(rollouts.items()):
-        trace, here = traces[name], _path("rollouts", name)
-        _log_scene(recording, here, layout, layout.to_metres(np.array([start, goal])))
+        trace, here, goal = episode.trace, _path("rollouts", name), episode.goal
+        assert trace is not None
+        _log_scene(recording, here, layout, layout.to_metres(np.array([episode.start, goal])))
         _log_ways(recording, here, trace, layout, distance, goal)
         if maps and name in maps:
             _log_policy(recording, f"{here}/policy", layout, maps[name])
@@ -119,8 +172,6 @@ def write_recording(
         _log_curves(recording, _path("distance_to_goal", name), _times(trace), {name: to_goal}, [colour])
         _log_reward_and_action(recording, name, trace, robot)
         _log_states(recording, _path("state", name), episode, trace, robot)
-    # Only this writes the footer that readers need.
-    recording.disconnect()
 
 
 def write_overlay(
@@ -149,7 +200,9 @@ def write_overlay(
     if not traces or len(traces) < len(episodes):
         raise ValueError(f"a recording needs episodes, each with a trace: {len(episodes)} have {len(traces)}")
     card = _overlay_card(title, episodes, properties)
-    recording = _begin(path, _overlaid(layout), title, properties, card)
+    recording = rr.RecordingStream("gridnav", send_properties=False)
+    recording.save(path, default_blueprint=_overlaid(layout))
+    _log_head(recording, title, properties, card)
     _log_maze(recording, "/maze", layout)
     ends = [[layout.to_metres(np.array(cell)) for cell in (one.start, one.goal)] for one in episodes]
     marks = np.concatenate([np.array(ends), np.full((len(ends), 2, 1), 0.006)], axis=2)
@@ -170,17 +223,13 @@ def write_overlay(
     recording.disconnect()
 
 
-def _begin(
-    path: str | Path, blueprint: rrb.Blueprint, title: str, properties: Mapping[str, object] | None, card: str
-) -> rr.RecordingStream:
-    recording = rr.RecordingStream("gridnav", send_properties=False)
-    recording.save(path, default_blueprint=blueprint)
+def _log_head(recording: rr.RecordingStream, title: str, properties: Mapping[str, object] | None, card: str) -> None:
+    """Name, properties and run card."""
     recording.send_recording_name(title)
     if properties:
         shown = {key: str(value) for key, value in properties.items()}
         recording.send_property("run", rr.AnyValues(drop_untyped_nones=True, **shown))
     recording.log("run_card", rr.TextDocument(card, media_type=rr.MediaType.MARKDOWN), static=True)
-    return recording
 
 
 # ---- The scene ---------------------------------------------------------------------------------
@@ -587,7 +636,7 @@ def _eye(layout: Layout, n_views: int) -> rrb.EyeControls3D:
     width, height = layout.size_m
     centre = np.array([width / 2, height / 2, 0.0])
     tilt = np.deg2rad(20.0)
-    away = max(1.05, 0.47 * n_views) * max(width, height) * np.array([0.0, -np.sin(tilt), np.cos(tilt)])
+    away = max(1.4, 0.47 * n_views) * max(width, height) * np.array([0.0, -np.sin(tilt), np.cos(tilt)])
     return rrb.EyeControls3D(kind="Orbital", position=centre + away, look_target=centre, eye_up=[0, 0, 1])
 
 

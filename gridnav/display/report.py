@@ -1,6 +1,6 @@
 """A run as one HTML page: the question, the answer, its evidence, and how to make it again.
 
-The page asks no other site for anything and runs no script, so it can be mailed, archived and printed.
+The page asks no other site for anything, and its one script sorts the table, so it can be mailed, archived and printed.
 """
 
 from __future__ import annotations

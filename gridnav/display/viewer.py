@@ -41,6 +41,41 @@ def open_window(recording_path: str | Path) -> None:
         raise _failure(done.stderr)
 
 
+def open_empty_window() -> int:
+    """Open the native viewer and leave it to the user, who closes it; the port where it takes recordings.
+
+    Raises:
+        ViewerError: When there is no display, no viewer, or no graphics driver.
+    """
+    if not has_display():
+        raise ViewerError(
+            "no display here for --live: start `rerun --bind 127.0.0.1 --port 9876` where there is one and give "
+            "--live-port 9876, or leave --live out"
+        )
+    port = free_port()
+    process = subprocess.Popen(
+        [*_command(str(port)), "--hide-welcome-screen"], env=_environment(), stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+    )  # fmt: skip
+    wait_until(lambda: process.poll() is not None or is_open(port), "start")
+    if process.poll() is not None:
+        raise ViewerError("the Rerun viewer ended at once: `gridnav doctor` says what is missing")
+    return port
+
+
+def address_of(port: int) -> str:
+    """Where a viewer on this machine takes recordings.
+
+    Raises:
+        ViewerError: When nobody listens there.
+    """
+    if not is_open(port):
+        raise ViewerError(
+            f"no viewer listens on port {port} of this machine: start `rerun --bind 127.0.0.1 --port {port}`"
+        )
+    return f"rerun+http://127.0.0.1:{port}/proxy"
+
+
 def has_display() -> bool:
     """Whether a window can be opened here."""
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -13,6 +13,7 @@ import numpy as np
 from gridnav.agents import Agent, OnProgress, Progress
 from gridnav.envs import LayoutMix, NavigationVectorEnv
 from gridnav.experiment.checkpoint import Checkpoint, Standing, save_checkpoint
+from gridnav.experiment.live import Watch
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
 from gridnav.experiment.validation import Validation
 from gridnav.problem.types import InputError, IntArray, State
@@ -39,6 +40,7 @@ class Course:
         log: Where metrics go.
         report: Told of the progress.
         checkpoint_s: Seconds between two checkpoints; 0 makes one at every opportunity.
+        watch: Looks at the agent whenever it likes.
     """
 
     def __init__(
@@ -53,7 +55,9 @@ class Course:
         log: MetricsLog,
         report: OnProgress,
         checkpoint_s: float,
+        watch: Watch | None = None,
     ) -> None:
+        self._watch = watch
         self._name, self.agent, self._worlds, self._validation = name, agent, worlds, validation
         self._before, self._saved = before, saved
         self._run, self._log, self._report = run, log, report
@@ -110,6 +114,8 @@ class Course:
                 self._save(self._standing(is_finished=False), training(), self._worlds.get_state())
         if self._interruption.is_asked:
             raise KeyboardInterrupt
+        if self._watch is not None:
+            self._watch(self.agent, self._steps)
         # After the checkpoint, for a continued training comes by here again.
         if self._validation is not None and self._validation.is_due(self._steps):
             self._judge(self._validation)

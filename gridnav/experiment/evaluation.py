@@ -87,7 +87,7 @@ def evaluate(
         on_info: Given the info of the start and of what each step led to.
 
     Returns:
-        One record per environment, with its trace.
+        One record per environment, with its trace; none where a policy stopped before it began.
     """
     if worlds.max_episode_steps is None:
         raise ValueError("evaluation needs a time limit: set max_episode_steps")
@@ -103,6 +103,8 @@ def evaluate(
         try:
             actions = policy(observations)
         except PolicyStopped:
+            if not course.n_steps:
+                return []
             last = [last[i] if not running[i] else _of_one(info, i) for i in range(n)]
             break
         observations, rewards, terminated, truncated, info = worlds.step(actions)
@@ -172,6 +174,10 @@ class _Course:
         self._rewards: list[AnyArray] = []
         self._hits: list[AnyArray] = []
         self._terms: list[dict[str, AnyArray]] = []
+
+    @property
+    def n_steps(self) -> int:
+        return len(self._actions)
 
     def add_state(self, info: dict[str, Any]) -> None:
         self._poses.append(info["pose"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from gridnav.experiment.live import Spectator
 from gridnav.experiment.pictures import pictures
 from gridnav.experiment.results import (
     open_log,
@@ -35,6 +36,7 @@ def climb(
     on_stage: OnStage,
     *,
     checkpoint_s: float,
+    spectator: Spectator | None = None,
 ) -> list[Result]:
     """All rungs, in order, written to a run directory.
 
@@ -47,9 +49,10 @@ def climb(
         config: The run's configuration, for the report.
         on_stage: Told of every training and evaluation.
         checkpoint_s: Seconds between two checkpoints of a training.
+        spectator: Watches every training.
     """
     with open_log(run) as log:
-        workshop = Workshop(problem, budget, seed, run, log, on_stage, checkpoint_s=checkpoint_s)
+        workshop = Workshop(problem, budget, seed, run, log, on_stage, checkpoint_s=checkpoint_s, spectator=spectator)
         plan = workshop.train("plan", "plan", "GridWorld")
         results = [workshop.evaluate("plan", plan, "GridWorld", "value iteration")]
 

@@ -52,7 +52,7 @@ def play(problem: Problem, world: str, seed: int) -> list[Episode]:
             while not window.is_closed:
                 driver = _Driver(worlds, window)
                 done = evaluate(driver.act, worlds, seed=seed + len(episodes), on_info=driver.look)
-                episodes += [episode for episode in done if episode.steps]
+                episodes += done
                 if not window.is_closed:
                     driver.wait_for_next(done[0])
     finally:

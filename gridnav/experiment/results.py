@@ -13,6 +13,7 @@ from gridnav.display.recording import write_recording
 from gridnav.display.report import Picture, Report, Rung, write_report
 from gridnav.experiment.checkpoint import LIBRARIES, last_standing, load_agent
 from gridnav.experiment.evaluation import EVALUATION_SEED, HELD_OUT_LAYOUTS, evaluate_in
+from gridnav.experiment.live import Spectator
 from gridnav.experiment.pictures import pictures
 from gridnav.experiment.rollouts import Rollouts, save_rollouts
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory, read_json, write_json
@@ -156,6 +157,7 @@ def train_and_report(
     on_stage: OnStage,
     *,
     checkpoint_s: float,
+    spectator: Spectator | None = None,
 ) -> list[Result]:
     """Train agents in a world, evaluate them and write everything a run holds.
 
@@ -171,9 +173,10 @@ def train_and_report(
         config: The run's configuration, for the report.
         on_stage: Told of the trainings and evaluations.
         checkpoint_s: Seconds between two checkpoints of a training.
+        spectator: Watches every training.
     """
     with open_log(run) as log:
-        workshop = Workshop(problem, budget, seed, run, log, on_stage, checkpoint_s=checkpoint_s)
+        workshop = Workshop(problem, budget, seed, run, log, on_stage, checkpoint_s=checkpoint_s, spectator=spectator)
         trained = [workshop.train(kind, kind, world, choice=choice) for kind in kinds]
         results = [workshop.evaluate(one.name, one, world, one.name) for one in trained]
         write_evaluation(run, results, seed)

@@ -13,6 +13,7 @@ from gridnav.envs import LayoutMix, NavigationVectorEnv
 from gridnav.experiment.checkpoint import Checkpoint, Standing, load_checkpoint
 from gridnav.experiment.course import CHECKPOINT_S, UNFIT, Course, bring_back
 from gridnav.experiment.evaluation import evaluate_in
+from gridnav.experiment.live import Spectator
 from gridnav.experiment.policy_maps import policy_maps
 from gridnav.experiment.presets import choose_config
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
@@ -136,6 +137,7 @@ class Workshop:
         log: Where metrics go.
         on_stage: Told of every training and evaluation.
         checkpoint_s: Seconds between two checkpoints of a training; 0 makes one at every opportunity.
+        spectator: Watches every training.
     """
 
     def __init__(
@@ -148,7 +150,9 @@ class Workshop:
         on_stage: OnStage,
         *,
         checkpoint_s: float = CHECKPOINT_S,
+        spectator: Spectator | None = None,
     ) -> None:
+        self._spectator = spectator
         self.problem, self.budget, self.seed = problem, budget, seed
         self._run, self._log, self._on_stage, self._checkpoint_s = run, log, on_stage, checkpoint_s
         self._run_steps = 0
@@ -184,8 +188,9 @@ class Workshop:
             agent, before = saved.agent, saved.standing
             bring_back(worlds, saved, name)
         validation = make_validation(self.problem, agent, world, steps, self.budget, saved)
+        watch = self._spectator.watch(name, world, choice.observation) if self._spectator else None
         course = Course(
-            name, agent, worlds, validation, before, saved, self._run, self._log, report, self._checkpoint_s
+            name, agent, worlds, validation, before, saved, self._run, self._log, report, self._checkpoint_s, watch
         )
         end = course.go(steps)
         worlds.close()

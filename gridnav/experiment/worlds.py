@@ -45,26 +45,33 @@ class Problem:
         *,
         observation: str = "cell_goal",
         layout: Layout | None = None,
-        render_mode: str | None = None,
+        **options: Any,
     ) -> NavigationVectorEnv:
-        """Robots that play this problem, in its layout or in another one."""
+        """Robots that play this problem, in its layout or in another one; other options go to the environments."""
         return make_worlds(
-            world, num_envs, layout=layout or self.layout, task=self.task, reward=self.reward, render_mode=render_mode,
-            **_grid_options(world, observation),
+            world, num_envs, layout=layout or self.layout, task=self.task, reward=self.reward,
+            **_grid_options(world, observation), **options,
         )  # fmt: skip
 
     def training_worlds(
-        self, world: str, num_envs: int, *, observation: str = "cell_goal", exploring_starts: bool = False
+        self, world: str, num_envs: int, *, observation: str = "cell_goal", exploring_starts: float = 0.0
     ) -> NavigationVectorEnv | LayoutMix:
-        """Robots to learn with: in layouts that change where there is a family, from any start if asked for."""
-        problem = replace(self, task=replace(self.task, starts="any")) if exploring_starts else self
-        if self.family is None:
-            return problem.worlds(world, num_envs, observation=observation)
-        return LayoutMix(
-            lambda layout, n: problem.worlds(world, n, observation=observation, layout=layout),
-            num_envs,
-            self.family.draw,
-        )
+        """Robots to learn with, in layouts that change where there is a family.
+
+        Args:
+            world: ``GridWorld``, ``Unicycle`` or ``DiffDrive``.
+            num_envs: How many.
+            observation: What an agent of the grid sees.
+            exploring_starts: Share of the episodes that begin anywhere; on the grid all of them, if it is not 0.
+        """
+        on_grid = world == "GridWorld"
+        problem = replace(self, task=replace(self.task, starts="any")) if exploring_starts and on_grid else self
+        options = {} if on_grid else {"exploring_starts": exploring_starts}
+
+        def worlds(layout: Layout, n: int) -> NavigationVectorEnv:
+            return problem.worlds(world, n, observation=observation, layout=layout, **options)
+
+        return worlds(self.layout, num_envs) if self.family is None else LayoutMix(worlds, num_envs, self.family.draw)
 
 
 def make_worlds(world: str, num_envs: int, **options: Any) -> NavigationVectorEnv:
