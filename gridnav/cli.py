@@ -351,10 +351,10 @@ class View(_Episodes):
             screenshot(recording, self.screenshot, time_s=self.time_s)
             stdout.print(str(self.screenshot))
         elif self.web:
-            with web_viewer(recording, self.port) as (address, has_ended):
+            with web_viewer(recording, self.port) as (address, is_running):
                 stdout.print(f"{address}\nopen this in a browser on this machine; Ctrl-C ends it")
                 with contextlib.suppress(KeyboardInterrupt):
-                    while not has_ended():
+                    while is_running():
                         time.sleep(0.2)
         else:
             open_window(recording)
