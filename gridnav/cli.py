@@ -353,6 +353,7 @@ class View(_Episodes):
         elif self.web:
             with web_viewer(recording, self.port) as (address, is_running):
                 stdout.print(f"{address}\nopen this in a browser on this machine; Ctrl-C ends it")
+                sys.stdout.flush()
                 with contextlib.suppress(KeyboardInterrupt):
                     while is_running():
                         time.sleep(0.2)

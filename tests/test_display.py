@@ -17,7 +17,8 @@ from rerun.chunk import RrdReader
 
 from gridnav.display import palette
 from gridnav.display.figures import trajectories
-from gridnav.display.recording import screenshot, write_recording
+from gridnav.display.policy_map import PolicyMap
+from gridnav.display.recording import screenshot, write_overlay, write_recording
 from gridnav.display.report import Picture, Report, Rung, write_report
 from gridnav.display.viewer import ViewerError, open_window
 from gridnav.problem.layout import Layout
@@ -25,6 +26,9 @@ from gridnav.problem.metrics import Episode, Trace, summarise
 from gridnav.problem.robot import BURGER
 
 CORRIDOR = Layout.from_text("S...G\n.###.\n.....\n")
+
+
+MAP = PolicyMap(np.arange(15.0).reshape(3, 5), np.zeros((3, 5)), np.ones((3, 5)))
 
 
 @pytest.fixture(autouse=True)
@@ -99,9 +103,9 @@ def test_rays_are_as_long_as_the_scan_and_only_measured_walls_have_points(tmp_pa
 
     write_recording(path, CORRIDOR, {"robot": drive(steps=3)})
 
-    rays = np.array(columns(path, "/rollouts/robot/robot/lidar/rays", "LineStrips3D:strips"))
-    assert rays.shape == (4, 24, 2, 3)
-    lengths = np.linalg.norm(rays[:, :, 1] - rays[:, :, 0], axis=-1)
+    rays = np.array(columns(path, "/rollouts/robot/robot/lidar/rays", "Arrows3D:vectors"))
+    assert rays.shape == (4, 24, 3)
+    lengths = np.linalg.norm(rays, axis=-1)
     np.testing.assert_allclose(lengths[0], [1.0] * 6 + [3.5] * 18, rtol=1e-6)
     points = np.array(columns(path, "/rollouts/robot/robot/lidar/hits", "Points3D:positions"))
     assert points.shape == (4, 6, 3)
@@ -167,6 +171,65 @@ def test_a_recording_is_written_in_columns_and_not_step_by_step(tmp_path: Path) 
 
     chunks = [chunk for chunk in RrdReader(path).stream() if not chunk.is_static]
     assert len(chunks) == len({chunk.entity_path for chunk in chunks}), "one chunk per moving entity"
+
+
+def test_a_long_rollout_stays_small(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+
+    write_recording(path, CORRIDOR, {"robot": drive(steps=500)}, maps={"robot": MAP})
+
+    assert path.stat().st_size <= 600_000
+
+
+def test_values_and_policy_lie_on_the_floor(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+
+    write_recording(path, CORRIDOR, {"robot": drive()}, maps={"robot": MAP})
+
+    (pixels,) = columns(path, "/rollouts/robot/policy/values", "GridMap:data")
+    # By hand: 0 to 14 over 15 cells become 0 to 255, row 0 first; walls count as the lowest.
+    grid = np.frombuffer(bytes(pixels[0]), np.uint8).reshape(3, 5)
+    np.testing.assert_array_equal(grid[0], np.round(np.arange(5) / 14 * 255))
+    np.testing.assert_array_equal(grid[1, 1:4], [0, 0, 0])
+    assert grid[2, 4] == 255
+    (arrows,) = columns(path, "/rollouts/robot/policy/arrows", "Arrows3D:vectors")
+    assert len(arrows) == 12, "one in each free cell"
+    np.testing.assert_allclose(arrows[0], [0.65 * 0.5, 0.0, 0.0], atol=1e-6)
+
+
+def test_the_wheels_roll_as_far_as_the_robot_drives(tmp_path: Path) -> None:
+    path, episode = tmp_path / "run.rrd", drive(steps=10)
+    assert episode.trace is not None
+
+    write_recording(path, CORRIDOR, {"robot": episode})
+
+    speeds = np.array(columns(path, "/wheel_speed/robot", "Scalars:scalars"))
+    # By hand: 0.2 m along x in 0.2 s, seen along a heading of 30 degrees: cos 30 m/s on wheels of 0.033 m.
+    np.testing.assert_allclose(speeds, np.full((10, 2), np.cos(np.pi / 6) / 0.033), rtol=1e-6)
+
+
+def test_the_timeline_says_what_the_robot_does_and_how_it_ended(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+
+    write_recording(path, CORRIDOR, {"a": drive(steps=10, hits=(3, 4)), "b": drive(is_success=False)})
+
+    assert columns(path, "/state/a", "StateChange:state") == [["driving"], ["collided"], ["driving"], ["arrived"]]
+    assert columns(path, "/state/a", "step") == [0, 3, 5, 10]
+    assert columns(path, "/state/b", "StateChange:state") == [["driving"], ["out of time"]]
+
+
+def test_many_episodes_lie_one_above_the_other(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+
+    write_overlay(path, CORRIDOR, [drive(steps=4), drive(steps=10), drive(steps=6, is_success=False)])
+
+    (trails,) = columns(path, "/trails/arrived", "LineStrips3D:strips")
+    assert [len(trail) for trail in trails] == [5, 11]
+    shares = np.array(columns(path, "/arrived", "Scalars:scalars"))[:, 0]
+    np.testing.assert_allclose(shares, [0] * 4 + [1 / 3] * 6 + [2 / 3])
+    robots = np.array(columns(path, "/robots", "Points3D:positions"))
+    assert robots.shape == (11, 3, 3)
+    np.testing.assert_allclose(robots[-1, 0, :2], [2.25, 1.25], rtol=1e-6)
 
 
 def test_a_name_with_slashes_and_spaces_stays_one_entity(tmp_path: Path) -> None:

@@ -400,14 +400,14 @@ def _log_lidar(recording: rr.RecordingStream, at: str, trace: Trace, robot: Robo
     angles = np.arange(n_beams) * (2 * np.pi / max(n_beams, 1))
     directions = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(n_beams)])
     ends = trace.scans_m[..., None] * directions
-    rays = np.stack([np.zeros_like(ends), ends], axis=2).astype(np.float32)
     measured = np.isfinite(trace.scans_m)
     # A beam that reads the longest range met nothing.
     hit = measured & (trace.scans_m < robot.lidar_range_m)
 
-    recording.log(f"{at}/rays", rr.LineStrips3D.from_fields(radii=[-0.5], colors=_rgba(palette.SKY)), static=True)
+    recording.log(f"{at}/rays", rr.Arrows3D.from_fields(radii=[-0.5], colors=_rgba(palette.SKY)), static=True)
     recording.log(f"{at}/hits", rr.Points3D.from_fields(radii=[-4.0], colors=_rgba(palette.PURPLE)), static=True)
-    lines = rr.LineStrips3D.columns(strips=rays[measured]).partition(measured.sum(axis=1))
+    # Arrows begin at the lidar by themselves: half of what strips of two points take.
+    lines = rr.Arrows3D.columns(vectors=ends[measured]).partition(measured.sum(axis=1))
     points = rr.Points3D.columns(positions=ends[hit]).partition(hit.sum(axis=1))
     _send(recording, f"{at}/rays", _times(trace), lines)
     _send(recording, f"{at}/hits", _times(trace), points)
