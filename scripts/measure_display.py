@@ -1,7 +1,8 @@
 """Measures what looking costs; run it with nothing else running.
 
-python scripts/measure_display.py      a rollout of 500 steps with 24 rays as a recording, time and size; a screenshot; a
-                                       film of 30 s; from the command to the served page; what watching takes of a training
+python scripts/measure_display.py
+
+Times and size of a recording of 500 steps with 24 rays, a screenshot, films of 30 s, the way from the command to the page.
 """
 
 import statistics
