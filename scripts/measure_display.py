@@ -2,7 +2,7 @@
 
 python scripts/measure_display.py
 
-Times and size of a recording of 500 steps with 24 rays, a screenshot, films of 30 s, the way from the command to the page.
+Times and size of a recording of 500 steps with 24 rays, a screenshot, films of 30 s, and how long a page takes to come.
 """
 
 import statistics
