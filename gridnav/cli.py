@@ -288,8 +288,10 @@ class _Episodes:
 class View(_Episodes):
     """Look at a run, or at several side by side, in the Rerun viewer: a window, a browser or a picture."""
 
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
-    """Run directories; several show the same episode side by side."""
+    run: Annotated[Path, tyro.conf.Positional] = Path()
+    """A run directory."""
+    compare: tuple[Path, ...] = ()
+    """Other runs, whose same episode is shown beside it."""
     overlay: bool = False
     """All episodes at once, in one maze."""
     web: bool = False
@@ -305,8 +307,6 @@ class View(_Episodes):
 
     def __call__(self) -> int:
         """Run it."""
-        if not self.runs:
-            raise InputError("view needs the folder of at least one run")
         if sum((self.web, self.save is not None, self.screenshot is not None)) > 1:
             raise InputError("--web, --save and --screenshot exclude each other: give one of them")
         if not 0 <= self.port < 65536 or (self.port and not self.web):
@@ -322,14 +322,14 @@ class View(_Episodes):
         """The recording of what was asked for: the run's own one, or a new one."""
         from gridnav.experiment.viewing import Pick, find_rollouts, record_episode, record_overlay
 
-        runs = [RunDirectory.open(path) for path in self.runs]
+        runs = [RunDirectory.open(path) for path in (self.run, *self.compare)]
         pick = Pick(self.episode, self.worst, self.failed)
         if self.overlay and pick.is_given:
             raise InputError("--overlay shows all episodes: leave --episode, --worst and --failed out")
         if len(runs) == 1 and not (pick.is_given or self.rollouts or self.overlay):
             recording = runs[0].recording
             if not recording.is_file():
-                raise InputError(f"{str(self.runs[0])!r} has no {recording.name}: the run has not finished")
+                raise InputError(f"{str(self.run)!r} has no {recording.name}: the run has not finished")
             check_recording(recording)
             return recording
         found = find_rollouts(runs, self.rollouts)

@@ -34,7 +34,7 @@ def pictures(
     curves: Mapping[str, str],
     log: MetricsLog,
 ) -> list[Picture]:
-    """The figures of a run, each also as a PNG file.
+    """The figures of a run, each also as a PNG and an SVG file.
 
     Args:
         run: Where the files go.
@@ -46,7 +46,8 @@ def pictures(
     """
     shown = dict(_drawn(problem, results, trained, curves, log))
     for name, picture in shown.items():
-        save_figure(picture.figure, run.figures / f"{name}.png")
+        for ending in (".png", ".svg"):
+            save_figure(picture.figure, run.figures / f"{name}{ending}")
     return list(shown.values())
 
 
