@@ -92,9 +92,9 @@ def test_the_worst_episode_becomes_a_recording(run: Path, tmp_path: Path) -> Non
 
 
 def test_runs_stand_side_by_side(run: Path, tmp_path: Path) -> None:
-    again = shutil.copytree(run, tmp_path / "again")
-    assert run_cli("view", str(run), "--compare", str(again), "--episode", "2", "--save", str(tmp_path / "two.rrd")) == 0
-    shown = {path.split("/")[2] for path in entities(tmp_path / "two.rrd") if path.startswith("/rollouts/")}
+    again, saved = shutil.copytree(run, tmp_path / "again"), tmp_path / "two.rrd"
+    assert run_cli("view", str(run), "--compare", str(again), "--episode", "2", "--save", str(saved)) == 0
+    shown = {path.split("/")[2] for path in entities(saved) if path.startswith("/rollouts/")}
     assert shown == {r"q\:\ q-learning", r"again\:\ q-learning"}
 
 

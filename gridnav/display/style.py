@@ -44,7 +44,10 @@ def signed(value: float) -> str:
 
 def save_figure(figure: Figure, path: str | Path) -> None:
     """Write a figure; the suffix says how, ``.png`` or ``.svg``."""
-    figure.savefig(path, dpi=SAVE_DPI)
+    if Path(path).suffix == ".svg":
+        Path(path).write_text(svg_text(figure), encoding="utf-8")
+    else:
+        figure.savefig(path, dpi=SAVE_DPI)
 
 
 def svg_text(figure: Figure) -> str:
