@@ -48,7 +48,15 @@ def words(agent: str, pieces: int, seed: int) -> list[str]:
     changes = {
         "q-learning": ["num_envs=16", f"visits={max(1, pieces * 16 // 48 + 1)}"],  # a table of 48 entries
         "dqn": ["num_envs=16", f"steps={pieces * 16 * quick}", "hidden=[32]", "batch_size=32", "warm_up=100"],
-        "ppo": ["num_envs=8", f"steps={pieces * 64 * quick}", "hidden=[32]", "n_steps=8", "batch_size=32"],
+        "ppo": [
+            "num_envs=8",
+            f"steps={pieces * 64 * quick}",
+            "hidden=[32]",
+            "n_steps=8",
+            "batch_size=32",
+            f"n_validations={6 * quick}",
+            "validation_episodes=4",
+        ],
     }[agent]
     problem = ["--agent", agent, "--layout", LAYOUT, "--budget", "quick", "--seed", str(seed)]
     return ["train", *problem, "--set", *changes]

@@ -79,7 +79,7 @@ def _drawn(
     for one in trained:
         suffix = f"-{one.name}" if len(trained) > 1 else ""
         yield f"values{suffix}", _values(problem, one)
-        if one.visits is not None:
+        if one.visits is not None and one.visits.any():
             words = f"Where {one.name} was in training, looked at each time it could have been cut."
             yield f"visits{suffix}", Picture(visit_counts(layout, one.visits), words)
     told, candidates = results[-1], list(here.values())[-1]
