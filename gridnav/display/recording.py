@@ -204,13 +204,13 @@ def write_overlay(
     recording.save(path, default_blueprint=_overlaid(layout))
     _log_head(recording, title, properties, card)
     _log_maze(recording, "/maze", layout)
-    ends = [[layout.to_metres(np.array(cell)) for cell in (one.start, one.goal)] for one in episodes]
-    marks = np.concatenate([np.array(ends), np.full((len(ends), 2, 1), 0.006)], axis=2)
-    for name, points, colour in zip(
-        ("starts", "goals"), marks.swapaxes(0, 1), (palette.START, palette.GOAL), strict=True
+    half = 0.45 * layout.cell_size_m
+    for name, cells, colour in (
+        ("starts", [one.start for one in episodes], palette.START),
+        ("goals", [one.goal for one in episodes], palette.GOAL),
     ):
-        tiles = rr.Points3D(np.unique(points, axis=0), colors=_rgba(colour), radii=0.1)
-        recording.log(f"/ends/{name}", tiles, static=True)
+        centres = layout.to_metres(np.unique(np.array(cells), axis=0))
+        _log_boxes(recording, f"/ends/{name}", np.column_stack([centres - half, centres + half]), 0.0, 0.004, colour)
     for is_success, name in ((True, "arrived"), (False, "missed")):
         ways = [
             np.column_stack([trace.poses[:, :2], np.full(len(trace.poses), 0.012)])
@@ -433,13 +433,13 @@ def _log_course(recording: rr.RecordingStream, at: str, trace: Trace, robot: Rob
 def _log_crowd(
     recording: rr.RecordingStream, layout: Layout, episodes: Sequence[Episode], traces: Sequence[Trace], robot: Robot
 ) -> None:
-    """All robots at once as discs, each until its end, where it stays."""
+    """All robots at once as balls, each until its end, where it stays."""
     longest = max(traces, key=lambda trace: float(trace.time_s[-1]))
     steps = np.arange(len(longest.time_s))
     at = np.stack([trace.poses[np.minimum(steps, len(trace.poses) - 1), :2] for trace in traces], axis=1)
-    points = np.concatenate([at, np.full((*at.shape[:2], 1), 0.03)], axis=2).astype(np.float32)
     colours = np.array([_rgba(palette.ARRIVED if one.is_success else palette.MISSED) for one in episodes])
     radius = GRID_BODY_SHARE * layout.cell_size_m / 2 if longest.is_on_grid else robot.radius_m
+    points = np.concatenate([at, np.full((*at.shape[:2], 1), radius)], axis=2).astype(np.float32)
     recording.log("/robots", rr.Points3D.from_fields(colors=colours, radii=[radius]), static=True)
     columns = rr.Points3D.columns(positions=points.reshape(-1, 3)).partition(np.full(len(steps), len(traces)))
     _send(recording, "/robots", _times(longest), columns)
