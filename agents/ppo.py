@@ -53,8 +53,10 @@ class PPOConfig:
     n_epochs: int = 6
     """Passes over a rollout."""
     learning_rate: float = 3e-3
-    """Adam's step size at the beginning; over the planned steps it falls to a hundredth, its root linearly. Larger late
-    steps make a policy that touches walls of one that does not, and back, from one rollout to the next."""
+    """Adam's step size at the beginning."""
+    learning_rate_power: float = 2.0
+    """Over the planned steps the step size falls by this power of a line from 1 to a tenth: by 2 to a hundredth. Larger
+    late steps make a policy that touches walls of one that does not, and back; smaller ones learn no large task."""
     gamma: float = 0.99
     """Discount per control period."""
     gae_lambda: float = 0.95
@@ -101,7 +103,9 @@ PPO_PRESETS: dict[str, PPOConfig] = {
     "default": PPOConfig(),
     # A policy that has learnt explores little: the step size of a beginner would throw it far off.
     "warm": PPOConfig(learning_rate=5e-4),
-    "any": PPOConfig(steps=2_200_000, validation_episodes=256),
+    "any": PPOConfig(
+        steps=2_700_000, learning_rate_power=1.0, hidden=(64, 64), log_std_final=-3.0, validation_episodes=256
+    ),
     "layouts": PPOConfig(steps=1_500_000, hidden=(64, 64), ignored=POSE),
 }
 """By what they were made for: DiffDrive on ``classic``, the same with a network that learnt elsewhere, any start to
@@ -174,7 +178,8 @@ class PPOAgent(Agent):
             n_steps=config.n_steps,
             batch_size=config.batch_size,
             n_epochs=config.n_epochs,
-            learning_rate=lambda left: config.learning_rate * (0.1 + 0.9 * left) ** 2,  # of the planned steps
+            # `left` is the share of the planned steps that is to come.
+            learning_rate=lambda left: config.learning_rate * (0.1 + 0.9 * left) ** config.learning_rate_power,
             gamma=config.gamma,
             gae_lambda=config.gae_lambda,
             ent_coef=config.ent_coef,
