@@ -78,8 +78,8 @@ class PPOConfig:
     reward_scale: float = 1.0
     """Factor on the rewards the learner sees: it keeps the value network's gradient from crowding out the policy's."""
     exploring_starts: float = 0.3
-    """Share of the training episodes that begin anywhere, half of them at a wall, and not where the task says: a policy
-    that explores less and less gets to know fewer and fewer ways to be stuck, and none out of them."""
+    """Share of the training episodes that begin anywhere, half of them at the nearest wall, and not where the task
+    says: a policy that explores less and less gets to know fewer and fewer ways to be stuck, and none out of them."""
     target_success: float | None = None
     """Training stops once this share of the last 400 episodes arrived; never before its steps are used up if none."""
 
@@ -178,8 +178,8 @@ class PPOAgent(Agent):
             n_steps=config.n_steps,
             batch_size=config.batch_size,
             n_epochs=config.n_epochs,
-            # `left` is the share of the planned steps that is to come.
-            learning_rate=lambda left: config.learning_rate * (0.1 + 0.9 * left) ** config.learning_rate_power,
+            # `left` is the share of the planned steps that is to come, below 0 where the last rollout goes beyond.
+            learning_rate=lambda left: config.learning_rate * (0.1 + 0.9 * max(left, 0)) ** config.learning_rate_power,
             gamma=config.gamma,
             gae_lambda=config.gae_lambda,
             ent_coef=config.ent_coef,

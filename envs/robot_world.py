@@ -46,8 +46,8 @@ class RobotVectorEnv(NavigationVectorEnv):
     Args:
         num_envs: Robots in the batch.
         control_period_s: Time between two commands, seconds; 0.2 s is one turn of the lidar (5 Hz).
-        exploring_starts: Share of the episodes that begin anywhere, half of them at a wall, whatever the task says; for
-            training: a robot that is never put there does not learn how to get away from a wall.
+        exploring_starts: Share of the episodes that begin anywhere, half of them at the nearest wall, whatever the task
+            says; for training: a robot that is never put there does not learn how to get away from a wall.
         shared: See ``NavigationVectorEnv``.
     """
 
@@ -109,9 +109,10 @@ class RobotVectorEnv(NavigationVectorEnv):
         ids, cells, draws = ids[moves], cells[moves], draws[moves]
         points = self.layout.to_metres(cells) + (draws[:, 2:4] - 0.5) * self.layout.cell_size_m
         nearest = self.robot.radius_m + STAND_OFF_M
-        # At a wall: one half of them.
+        # At the nearest wall: one half of them, where there is one within a cell.
         gap, direction, _ = clearances(points, self.layout)
-        points += np.where(draws[:, 4] < 0.5, gap - nearest, 0.0)[:, None] * direction
+        is_near = gap < self.layout.cell_size_m  # farther walls are not looked for
+        points += np.where((draws[:, 4] < 0.5) & is_near, gap - nearest, 0.0)[:, None] * direction
         for _ in range(3):  # off one wall, off the other one in a corner, and off the first again
             gap, direction, _ = clearances(points, self.layout)
             points -= np.maximum(nearest - gap, 0.0)[:, None] * direction

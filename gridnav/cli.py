@@ -159,8 +159,9 @@ class Ladder(_Run):
             raise InputError(
                 "the ladder needs one maze: its plan and its table are of one; train ppo on random layouts"
             )
-        budget, spectator = BUDGETS[self.budget], self._spectator(problem)
+        budget = BUDGETS[self.budget]
         with self._directory("ladder", config) as run, _progress() as on_stage:
+            spectator = self._spectator(problem)
             results = climb(
                 problem, budget, self.seed, run, _again(run), config, on_stage,
                 checkpoint_s=self.checkpoint_s, spectator=spectator,
@@ -195,8 +196,9 @@ class Train(_Run):
         problem, config = self._problem()
         choice = Choice(self.preset, self._changes(), self.observation)
         check_choice(kinds, problem, world, choice)
-        budget, spectator = BUDGETS[self.budget], self._spectator(problem)
+        budget = BUDGETS[self.budget]
         with self._directory(f"train-{self.agent}", config) as run, _progress() as on_stage:
+            spectator = self._spectator(problem)
             results = train_and_report(
                 problem, budget, self.seed, kinds, world, choice, run, _again(run), config, on_stage,
                 checkpoint_s=self.checkpoint_s, spectator=spectator,
@@ -311,9 +313,11 @@ class View(_Episodes):
             raise InputError("--web, --save and --screenshot exclude each other: give one of them")
         if not 0 <= self.port < 65536 or (self.port and not self.web):
             raise InputError(f"--port {self.port} must be from 0 to 65535, and goes with --web")
+        if self.time_s is not None and (self.screenshot is None or not 0 <= self.time_s <= 86_400):
+            raise InputError(f"--time-s {self.time_s} must be from 0 to 86400 seconds, and goes with --screenshot")
         for flag, file, ending in (("--save", self.save, ".rrd"), ("--screenshot", self.screenshot, ".png")):
             if file is not None:
-                _check_new_file(flag, file, ending)
+                _check_ending(flag, file, ending)
         with tempfile.TemporaryDirectory() as folder:
             self._show(self._recording(Path(folder)))
         return 0
@@ -357,6 +361,7 @@ class View(_Episodes):
                 with contextlib.suppress(KeyboardInterrupt):
                     while is_running():
                         time.sleep(0.2)
+                    raise ViewerError("the Rerun viewer ended by itself: start it again")
         else:
             open_window(recording)
 
@@ -381,7 +386,7 @@ class Video(_Episodes):
         from gridnav.experiment.video import write_video
         from gridnav.experiment.viewing import Pick, find_rollouts
 
-        _check_new_file("--output", self.output, ".mp4", ".gif")
+        _check_ending("--output", self.output, ".mp4", ".gif")
         found = find_rollouts([RunDirectory.open(self.run)], self.rollouts)
         if len(found) > 1:
             raise InputError(f"a film shows one agent, not {len(found)}: choose one with --rollouts")
@@ -422,8 +427,10 @@ class Play:
 
         if not 0 <= self.seed < 2**32:
             raise InputError(f"--seed {self.seed} is outside 0 to 4294967295")
-        if self.run_dir is not None and self.run_dir.exists() and any(self.run_dir.iterdir()):
-            raise InputError(f"run directory {str(self.run_dir)!r} exists and is not empty: name another one")
+        if self.run_dir is not None and self.run_dir.exists() and not RunDirectory(self.run_dir).is_fresh:
+            raise InputError(
+                f"run directory {str(self.run_dir)!r} exists and is not empty: name another with --run-dir"
+            )
         problem = Problem.load(self.layout, self.task, self.reward)
         world = self.env.split("/")[1].removesuffix("-v0")
         episodes = play(problem, world, self.seed)
@@ -574,7 +581,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except NonFiniteError as error:
         code, message, cause = 4, str(error), error
     except KeyboardInterrupt as error:
-        code, message, cause = 130, "interrupted; --resume goes on from the run's last checkpoint", error
+        resumes = words[:1] in (["train"], ["ladder"])
+        message = "interrupted" + ("; --resume goes on from the run's last checkpoint" if resumes else "")
+        code, cause = 130, error
     if debug:
         stderr.print("".join(traceback.format_exception(cause)), markup=False)
     stderr.print(f"gridnav: {message}", markup=False)
@@ -660,7 +669,7 @@ def _check_folder(flag: str, file: Path) -> None:
         raise InputError(f"{flag} {str(file)!r}: there is no folder {str(file.parent)!r}")
 
 
-def _check_new_file(flag: str, file: Path, *endings: str) -> None:
+def _check_ending(flag: str, file: Path, *endings: str) -> None:
     if file.suffix not in endings:
         raise InputError(f"{flag} {str(file)!r} must end with {' or '.join(endings)}")
     _check_folder(flag, file)
@@ -731,7 +740,8 @@ def _show(results: Sequence[Result], run: RunDirectory | None, *, title: str = "
         for note in _notes(result):
             stdout.print(f"{result.name}: {note}")
     if run is not None:
-        stdout.print(f"report     {run.report}")
+        if run.report.is_file():  # a drive has none
+            stdout.print(f"report     {run.report}")
         stdout.print(f"recording  {run.recording}   (gridnav view {shlex.quote(str(run.path))})")
 
 

@@ -215,7 +215,7 @@ def test_the_timeline_says_what_the_robot_does_and_how_it_ended(tmp_path: Path) 
 
     assert columns(path, "/state/a", "StateChange:state") == [["driving"], ["collided"], ["driving"], ["arrived"]]
     assert columns(path, "/state/a", "step") == [0, 3, 5, 10]
-    assert columns(path, "/state/b", "StateChange:state") == [["driving"], ["out of time"]]
+    assert columns(path, "/state/b", "StateChange:state") == [["driving"], ["did not arrive"]]
 
 
 def test_many_episodes_lie_one_above_the_other(tmp_path: Path) -> None:

@@ -78,9 +78,44 @@ def unknown_field(path: Path) -> None:
     path.write_text(json.dumps(values))
 
 
+def endless(path: Path) -> None:
+    values = json.loads(path.read_text())
+    values["step_s"][0] = 10**400
+    path.write_text(json.dumps(values))
+
+
+def in_a_wall(path: Path) -> None:
+    values = json.loads(path.read_text())
+    values["rows"][0]["goal"] = [1, 1]
+    path.write_text(json.dumps(values))
+
+
+def words(path: Path) -> None:
+    values = json.loads(path.read_text())
+    values["rows"][0]["episode_return"] = "much"
+    path.write_text(json.dumps(values))
+
+
+def not_a_number(path: Path) -> None:
+    arrays = load_file(path)
+    arrays["poses"][3, 0] = np.nan
+    save_file(arrays, path)
+
+
+def flat(path: Path) -> None:
+    arrays = load_file(path)
+    arrays["scans_m"] = arrays["scans_m"][:, 0].copy()
+    save_file(arrays, path)
+
+
 @pytest.mark.parametrize(
     ("part", "damage"),
     [
+        ("drive.safetensors", not_a_number),
+        ("drive.safetensors", flat),
+        ("drive.json", endless),
+        ("drive.json", in_a_wall),
+        ("drive.json", words),
         ("drive.safetensors", cut),
         ("drive.safetensors", shorten),
         ("drive.safetensors", negative),

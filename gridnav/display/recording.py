@@ -14,7 +14,7 @@ the processes. A recording holds rollouts on common timelines, ``sim_time`` in s
     /distance_to_goal/NAME, /state/NAME
     /run_card                                             what this is, in Markdown
 
-An overlay of many episodes has ``/maze``, ``/trails``, ``/robots``, ``/ends`` and ``/distance_to_goal`` instead.
+An overlay of many episodes has ``/maze``, ``/trails``, ``/robots``, ``/ends`` and ``/arrived`` instead.
 Data goes in as columns, one call per entity: one call per step is forty times slower.
 """
 
@@ -39,14 +39,12 @@ from gridnav.display.viewer import ViewerError, existing, headless_viewer, wait_
 from gridnav.problem.geodesic import Geodesic, cell_path
 from gridnav.problem.layout import Layout
 from gridnav.problem.metrics import Episode, Trace
-from gridnav.problem.robot import BURGER, Robot
+from gridnav.problem.robot import BURGER, LIDAR_HEIGHT_M, Robot
 from gridnav.problem.types import AnyArray, Cell, FloatArray, InputError
 
 WALL_HEIGHT_M = 0.25
 OUTER_WALL_M = 0.05
 """Thickness at which the outer wall is drawn."""
-LIDAR_HEIGHT_M = 0.182
-"""Of the scan plane of a TurtleBot3 Burger above the floor (ROBOTIS-GIT/turtlebot3, ``burger.urdf``)."""
 WHEEL_WIDTH_M = 0.018
 """Of the robot's tyres (ROBOTIS-GIT/turtlebot3, ``turtlebot3_burger.urdf``)."""
 BODY_HEIGHT_M = 0.192
@@ -70,7 +68,7 @@ STATES = {
     "standing": palette.GRID_LINE,
     "collided": palette.COLLISION,
     "arrived": palette.GOAL,
-    "out of time": palette.ORANGE,
+    "did not arrive": palette.ORANGE,
     "physics error": palette.PURPLE,
 }
 """What a robot is doing, and how an episode ended."""
@@ -389,8 +387,7 @@ def _wheel_speeds(trace: Trace, robot: Robot) -> FloatArray:
     middle = (heading[1:] + heading[:-1]) / 2
     forward = (np.diff(trace.poses[:, :2], axis=0) * np.column_stack([np.cos(middle), np.sin(middle)])).sum(axis=1)
     turn = np.diff(heading) * robot.wheel_separation_m / 2
-    # Diverged physics leaves a pose that is no number.
-    return np.nan_to_num(np.column_stack([forward - turn, forward + turn]) / robot.wheel_radius_m / step_s[:, None])
+    return np.column_stack([forward - turn, forward + turn]) / robot.wheel_radius_m / step_s[:, None]
 
 
 def _log_lidar(recording: rr.RecordingStream, at: str, trace: Trace, robot: Robot) -> None:
@@ -417,8 +414,7 @@ def _log_course(recording: rr.RecordingStream, at: str, trace: Trace, robot: Rob
     """The way taken, coloured by speed, and where it touched walls; both from start to end, at all times."""
     points = np.column_stack([trace.poses[:, :2], np.full(len(trace.poses), 0.012)])
     speeds = np.linalg.norm(np.diff(trace.poses[:, :2], axis=0), axis=1) / np.diff(trace.time_s)
-    # Diverged physics leaves a pose that is no number.
-    share = np.nan_to_num(np.clip(speeds / robot.max_speed_m_s, 0.0, 1.0))[:, None]
+    share = np.clip(speeds / robot.max_speed_m_s, 0.0, 1.0)[:, None]
     colours = np.round((1 - share) * _rgba(palette.SLOW) + share * _rgba(palette.FAST)).astype(np.uint8)
     trail = rr.LineStrips3D(np.stack([points[:-1], points[1:]], axis=1), colors=colours, radii=-2.0)
     recording.log(f"{at}/trail", trail, static=True)
@@ -452,7 +448,7 @@ def _log_crowd(
 def _log_states(recording: rr.RecordingStream, at: str, episode: Episode, trace: Trace, robot: Robot) -> None:
     """What the robot is doing, wherever that changes, and how the episode ended."""
     states = _states(trace, robot)
-    ended = "arrived" if episode.is_success else "physics error" if episode.physics_error else "out of time"
+    ended = "arrived" if episode.is_success else "physics error" if episode.physics_error else "did not arrive"
     names = [*states, ended]
     changes = [i for i in range(len(names)) if i == 0 or names[i] != names[i - 1]]
     style = rr.StateConfiguration(values=list(STATES), labels=list(STATES), colors=[_rgba(c) for c in STATES.values()])
@@ -720,7 +716,7 @@ def screenshot(
 def _end_s(client: ViewerClient) -> float:
     """Last moment of ``sim_time``, which the viewer counts in nanoseconds."""
     timelines = [t for recording in client.get_state().recordings for t in recording.timelines]
-    return max((t.end or 0) / 1e9 for t in timelines if t.name == "sim_time")
+    return max(((t.end or 0) / 1e9 for t in timelines if t.name == "sim_time"), default=0.0)
 
 
 def _settled_picture(client: ViewerClient) -> bytes:

@@ -35,10 +35,9 @@ def open_window(recording_path: str | Path) -> None:
             "no display here: use --screenshot out.png, --web for a browser on this machine, or --save out.rrd "
             "and open that with `rerun out.rrd` on a machine with a display"
         )
-    command = [*_command("auto"), str(path)]
-    done = subprocess.run(command, env=_environment(), capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        raise _failure(done.stderr)
+    with _running([*_command("auto"), str(path)]) as (process, log):
+        if process.wait() != 0:
+            raise _failure(_text(log))
 
 
 def open_empty_window() -> int:
@@ -57,7 +56,11 @@ def open_empty_window() -> int:
         [*_command(str(port)), "--hide-welcome-screen"], env=_environment(), stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
     )  # fmt: skip
-    wait_until(lambda: process.poll() is not None or is_open(port), "start")
+    try:
+        wait_until(lambda: process.poll() is not None or is_open(port), "start")
+    except BaseException:
+        _end(process)
+        raise
     if process.poll() is not None:
         raise ViewerError("the Rerun viewer ended at once: `gridnav doctor` says what is missing")
     return port

@@ -22,7 +22,7 @@ CHECKPOINT_S = 10.0
 """Seconds between two checkpoints of a training."""
 CHECKPOINT_SHARE = 0.01
 """Of the time of a training that its checkpoints may take: where one takes long, the next one waits longer."""
-UNFIT = LookupError, TypeError, ValueError, AttributeError, RuntimeError
+UNFIT = LookupError, TypeError, ValueError, AttributeError, RuntimeError, OverflowError
 """What comes of a checkpoint whose parts are whole and do not belong together."""
 
 

@@ -109,10 +109,12 @@ def evaluate(
             break
         observations, rewards, terminated, truncated, info = worlds.step(actions)
         course.add_step(actions, rewards, info)
+        # Where episodes go on by themselves, the info is the next one's first.
+        reached = info.get("final_info", info)
         if on_info:
-            on_info(info.get("final_info", info))
+            on_info(reached)
         for i in np.flatnonzero((terminated | truncated) & running):
-            last[i] = _of_one(info["final_info"], int(i))
+            last[i] = _of_one(reached, int(i))
             running[i] = False
         if on_progress and "final_info" in info:
             ended = n - int(running.sum())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable
 
@@ -12,7 +13,8 @@ from gridnav.experiment.policy_maps import policy_maps
 from gridnav.experiment.worlds import Problem
 
 LIVE_SEED = 3_000_000
-"""Seed of the episodes that are watched; nothing else uses it."""
+"""Seed of the episodes that are watched."""
+log = logging.getLogger("gridnav")
 SHARE = 0.02
 """Of the time of a training that watching may take: where an episode takes long, the next one waits longer."""
 
@@ -32,24 +34,33 @@ class Spectator:
     def __init__(self, problem: Problem, address: str, period_s: float) -> None:
         self._problem, self._address, self._period_s = problem, address, period_s
         self._due = time.perf_counter()
-        self._sent = 0
+        self._sent, self._is_over = 0, False
 
     def watch(self, name: str, world: str, observation: str) -> Watch:
         """How a training of that name, in that world, is watched."""
 
         def look(agent: Agent, steps: int) -> None:
-            if time.perf_counter() < self._due:
+            if self._is_over or time.perf_counter() < self._due:
                 return
             began = time.perf_counter()
-            worlds = self._problem.worlds(world, 1, observation=observation)
-            (episode,) = evaluate(policy_for(agent, worlds), worlds, seed=LIVE_SEED + self._sent)
-            worlds.close()
-            goal = episode.goal
-            shown = policy_maps(self._problem, agent, world, [goal], observation=observation)
-            title = f"{name} after {steps:,} steps"
-            send_recording(self._address, self._problem.layout, {name: episode}, maps={name: shown[goal]}, title=title)
-            self._sent += 1
+            try:
+                self._send(agent, name, world, observation, steps)
+            except Exception as error:  # whatever it is, it must not cost the training
+                log.warning("--live shows no more: %s", " ".join(str(error).split())[:150])
+                self._is_over = True
             now = time.perf_counter()
             self._due = now + max(self._period_s, (now - began) / SHARE)
 
         return look
+
+    def _send(self, agent: Agent, name: str, world: str, observation: str, steps: int) -> None:
+        worlds = self._problem.worlds(world, 1, observation=observation)
+        try:
+            (episode,) = evaluate(policy_for(agent, worlds), worlds, seed=LIVE_SEED + self._sent)
+        finally:
+            worlds.close()
+        maps = policy_maps(self._problem, agent, world, [episode.goal], observation=observation)
+        title = f"{name} after {steps:,} steps"
+        rollout, shown = {name: episode}, {name: maps[episode.goal]}
+        send_recording(self._address, self._problem.layout, rollout, maps=shown, title=title)
+        self._sent += 1

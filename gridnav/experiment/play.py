@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from typing import Any
 
@@ -14,6 +15,7 @@ from gridnav.envs import NavigationVectorEnv
 from gridnav.experiment.evaluation import PolicyStopped, evaluate
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.metrics import Episode
+from gridnav.problem.robot import LIDAR_HEIGHT_M
 from gridnav.problem.types import AnyArray
 
 MOVES = ("up", "down", "left", "right")
@@ -23,8 +25,6 @@ TURN = 0.35
 SLOW = 0.4
 """Factor while shift is held."""
 LISTEN_S = 0.02
-ABOVE_FOV_RAD = np.pi / 4
-"""Vertical field of view of MuJoCo's picture from above."""
 HINTS = {
     True: "arrows: one move",
     False: "arrows: drive and turn, shift: slowly",
@@ -46,9 +46,13 @@ def play(problem: Problem, world: str, seed: int) -> list[Episode]:
         ViewerError: When no window can be opened.
     """
     episodes: list[Episode] = []
-    worlds = problem.worlds(world, 1, render_mode="rgb_array")
+    # Without a reset of its own, what is drawn at the end is the end.
+    worlds = problem.worlds(world, 1, render_mode="rgb_array", autoreset=False)
     try:
-        with DriveWindow(f"gridnav play: {problem.layout.name} on {world}") as window:
+        with (
+            contextlib.suppress(KeyboardInterrupt),  # what was driven is kept
+            DriveWindow(f"gridnav play: {problem.layout.name} on {world}") as window,
+        ):
             while not window.is_closed:
                 driver = _Driver(worlds, window)
                 done = evaluate(driver.act, worlds, seed=seed + len(episodes), on_info=driver.look)
@@ -140,13 +144,10 @@ class _Driver:
         size = np.array(self._worlds.layout.size_m)
         if self._worlds.world == "DiffDrive":
             model = self._worlds.model  # type: ignore[attr-defined]
-            camera_m = float(model.cam("above").pos[2])
-            scale = height / 2 / np.tan(ABOVE_FOV_RAD / 2) / (camera_m - LIDAR_HEIGHT_M)
+            camera = model.cam("above")
+            above_m = float(camera.pos[2]) - LIDAR_HEIGHT_M
+            scale = height / 2 / np.tan(np.deg2rad(float(camera.fovy[0])) / 2) / above_m
         else:
             scale = height / size[1]
         centred = (points_w - size / 2) * scale
         return np.array([width / 2, height / 2]) + centred * [1.0, -1.0]
-
-
-LIDAR_HEIGHT_M = 0.182
-"""Of the scan plane above the floor (``assets/mjcf/burger.xml``)."""

@@ -25,9 +25,11 @@ from gridnav.problem.types import InputError
 _NEEDED = ("world", "agent", "carried", "checkpoint", "observation")
 
 
-def write_evaluation(run: RunDirectory, results: Sequence[Result], seed: int) -> None:
+def write_evaluation(
+    run: RunDirectory, results: Sequence[Result], seed: int, evaluation_seed: int = EVALUATION_SEED
+) -> None:
     """``evaluation.json``: every metric of every rung, and one row per episode."""
-    write_json(run.evaluation, {"seed": seed, "evaluation_seed": EVALUATION_SEED, "results": evaluation(results)})
+    write_json(run.evaluation, {"seed": seed, "evaluation_seed": evaluation_seed, "results": evaluation(results)})
 
 
 def evaluation(results: Sequence[Result]) -> dict[str, Any]:
@@ -87,9 +89,9 @@ def kept(problem: Problem, result: Result) -> Rollouts:
 
 
 def write_drives(run: RunDirectory, problem: Problem, world: str, episodes: list[Episode], seed: int) -> Result:
-    """What a person drove, as the evaluation, rollouts, recording and report of a run."""
+    """What a person drove, as the evaluation, rollouts and recording of a run."""
     result = Result("drive", world, "a person", "", "", episodes)
-    write_evaluation(run, [result], seed)
+    write_evaluation(run, [result], seed, evaluation_seed=seed)
     write_rollouts(run, problem, [result], [result], {"seed": seed})
     return result
 

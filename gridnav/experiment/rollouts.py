@@ -97,12 +97,15 @@ def load_rollouts(directory: Path, name: str) -> Rollouts:
             raise ValueError("it holds no episode, or one in an unknown layout")
         goals = [_cell(pair) for pair in values["map_goals"]]
         maps = {goal: PolicyMap(*(arrays[f"maps/{part}"][i] for part in MAPS)) for i, goal in enumerate(goals)}
-        if any(one.values.shape != layouts[episodes[0].layout].walls.shape for one in maps.values()):
+        shape = layouts[episodes[0].layout].walls.shape
+        if any(getattr(one, part).shape != shape for one in maps.values() for part in MAPS):
             raise ValueError("its maps have the wrong shape")
+        for episode in episodes:
+            _check(episode, layouts[episode.layout])
         return Rollouts(name, str(values["world"]), str(values["agent"]), layouts, episodes, maps)
     except FileNotFoundError:
         raise InputError(f"{str(directory)!r} holds no rollouts of {name!r}: {_there(directory)}") from None
-    except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"rollouts {str(directory / name)!r} are damaged: {reason:.120}") from None
 
@@ -119,8 +122,11 @@ def _there(directory: Path) -> str:
 
 def _traces(arrays: Mapping[str, AnyArray], step_s: Sequence[float]) -> list[Trace]:
     steps = arrays["steps"].astype(np.int64)
-    if steps.ndim != 1 or len(steps) != len(step_s) or (steps < 1).any():
+    most = len(arrays["actions"])
+    if steps.ndim != 1 or len(steps) != len(step_s) or (steps < 1).any() or (steps > most).any():
         raise ValueError("the lengths of its episodes are not what they should be")
+    if not all(isinstance(period, int | float) and 1e-3 <= period <= 1e3 for period in step_s):
+        raise ValueError("the lengths of its steps must be from 0.001 to 1000 seconds")
     ends = np.cumsum(steps)[:-1]  # of the steps; each episode has one state more
     n_states = np.cumsum(steps + 1)
     terms = {key.removeprefix("reward/"): arrays[key] for key in arrays if key.startswith("reward/")}
@@ -130,8 +136,12 @@ def _traces(arrays: Mapping[str, AnyArray], step_s: Sequence[float]) -> list[Tra
         len(array) != n_states[-1] for array in of_states.values()
     ):
         raise ValueError("its arrays are not as long as its episodes")
-    if arrays["poses"].shape[1] != 3 or arrays["actions"].shape[1] not in (1, 2):
-        raise ValueError("its poses or actions have the wrong shape")
+    shapes = [array.ndim == 2 for array in (arrays["poses"], arrays["scans_m"], arrays["actions"])]
+    flat = [array.ndim == 1 for array in (arrays["hits"], *terms.values())]
+    if not all(shapes + flat) or arrays["poses"].shape[1] != 3 or arrays["actions"].shape[1] not in (1, 2):
+        raise ValueError("its arrays have the wrong shape")
+    if not all(np.isfinite(array).all() for array in (arrays["poses"], arrays["actions"], *terms.values())):
+        raise ValueError("its poses, actions and rewards must be finite numbers")
     parts = {key: np.split(array, ends) for key, array in of_steps.items()}
     poses, scans = (np.split(array, n_states[:-1]) for array in of_states.values())
     return [
@@ -151,6 +161,20 @@ def _episode(row: dict[str, Any], trace: Trace) -> Episode:
     start, goal = (_cell(row[key]) for key in ("start", "goal"))
     motion = None if row["motion"] is None else Motion(**row["motion"])
     return Episode(**{**row, "start": start, "goal": goal, "motion": motion}, trace=trace)
+
+
+def _check(episode: Episode, layout: Layout) -> None:
+    """What pictures rely on: ends on free cells, a robot in the maze, numbers where numbers are."""
+    for row, column in (episode.start, episode.goal):
+        if not (0 <= row < layout.n_rows and 0 <= column < layout.n_cols) or layout.walls[row, column]:
+            raise ValueError(f"cell {(row, column)} is no free cell of its layout")
+    assert episode.trace is not None
+    places = episode.trace.poses[:, :2]
+    if (places < 0).any() or (places > layout.size_m).any():
+        raise ValueError("its robot leaves the maze")
+    numbers = ("episode_return", "path_length_m", "shortest_path_m", "elapsed_s", "collisions", "shortest_time_s")
+    if not all(isinstance(getattr(episode, name), int | float) for name in numbers):
+        raise ValueError("its rows hold words where numbers should be")
 
 
 def _cell(pair: Sequence[int]) -> Cell:

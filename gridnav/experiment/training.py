@@ -185,6 +185,11 @@ class Workshop:
         agent, worlds, steps = make_learner(self.problem, kind, world, self.seed, self.budget, choice, start)
         before = Standing(run_steps=self._run_steps)
         if saved is not None:
+            if getattr(saved.agent, "config", None) != getattr(agent, "config", None):
+                raise InputError(
+                    f"the checkpoint of {name!r} was trained with other hyper-parameters than these: they are another "
+                    "gridnav's; begin another run"
+                )
             agent, before = saved.agent, saved.standing
             bring_back(worlds, saved, name)
         validation = make_validation(self.problem, agent, world, steps, self.budget, saved)

@@ -13,7 +13,7 @@ from gridnav.problem.metrics import summarise
 from gridnav.problem.types import State
 
 VALIDATION_SEED = 2_000_000
-"""Seed of the validation's episodes; no training and no evaluation uses it."""
+"""Seed of the validation's episodes; no evaluation uses it, and no training unless asked for this very number."""
 BEGIN = 0.75
 """Share of the planned steps after which policies are judged."""
 
@@ -43,7 +43,8 @@ class Validation:
         self._best: State | None = None
         self._best_return, self._n_judged = -np.inf, 0
         if saved is not None:
-            self._best = State(saved.arrays, saved.values["agent"])
+            # Weights alone: what they belong to is known.
+            self._best = State(saved.arrays, agent.state().values)
             self._best_return, self._n_judged = float(saved.values["return"]), int(saved.values["n_judged"])
             self.best()
 
@@ -72,5 +73,5 @@ class Validation:
         """What goes on from here after a cut; none while no policy was judged."""
         if self._best is None:
             return None
-        values: dict[str, Any] = {"agent": self._best.values, "return": self._best_return, "n_judged": self._n_judged}
+        values: dict[str, Any] = {"return": self._best_return, "n_judged": self._n_judged}
         return State(self._best.arrays, values)

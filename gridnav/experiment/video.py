@@ -22,6 +22,8 @@ from gridnav.problem.types import AnyArray, FloatArray, InputError
 Camera = Literal["above", "chase", "onboard"]
 FPS = {".mp4": 20, ".gif": 10}
 """Pictures per second; a gif keeps every one of them whole."""
+LARGEST = (1920, 1080)
+"""Width and height of the robot model's off-screen buffer, ``assets/mjcf/burger.xml``."""
 GIF_COLOURS = 64
 LAST_S = 1.0
 """How long the last picture stays."""
@@ -66,8 +68,8 @@ def write_video(
         raise InputError(f"video {str(path)!r} must end with {' or '.join(FPS)}")
     if camera not in get_args(Camera):
         raise InputError(f"camera {camera!r} is unknown: choose {', '.join(get_args(Camera))}")
-    if not all(64 <= side <= 1920 and side % 2 == 0 for side in size):
-        raise InputError(f"size {size} must be two even numbers of 64 to 1920 pixels")
+    if any(side % 2 or not 64 <= side <= most for side, most in zip(size, LARGEST, strict=True)):
+        raise InputError(f"size {size} must be two even numbers from 64 to {LARGEST[0]} and {LARGEST[1]} pixels")
     if not 0.1 <= speed <= 100:
         raise InputError(f"speed {speed} must be from 0.1 to 100")
     if episode.trace is None:
@@ -78,14 +80,23 @@ def write_video(
         first, *others = (Image.fromarray(picture).quantize(GIF_COLOURS) for picture in pictures)
         first.save(path, save_all=True, append_images=others, duration=round(1000 / fps), loop=0)
         return
+    # Aside first, by its whole path: what breaks off leaves no half film, and no name is an option of the encoder's.
+    aside = path.resolve().with_name(f".tmp-{path.name}")
     # Every player knows H.264 with these colours; the quality is the encoder's usual one.
-    film = imageio_ffmpeg.write_frames(path, size, fps=fps, codec="libx264", pix_fmt_out="yuv420p", macro_block_size=2)
-    film.send(None)
+    film = imageio_ffmpeg.write_frames(aside, size, fps=fps, codec="libx264", pix_fmt_out="yuv420p", macro_block_size=2)
     try:
-        for picture in pictures:
+        for number, picture in enumerate(pictures):
+            if number == 0:
+                film.send(None)  # the encoder starts once there is something to encode
             film.send(np.ascontiguousarray(picture))
-    finally:
         film.close()
+        if not aside.is_file() or not aside.stat().st_size:
+            raise OSError(f"the encoder wrote no film to {str(path)!r}: is there room on the disk?")
+        aside.rename(path)
+    except RuntimeError as error:
+        raise OSError(f"the encoder failed: {' '.join(str(error).split())[:150]}") from error
+    finally:
+        aside.unlink(missing_ok=True)
 
 
 def _pictures(

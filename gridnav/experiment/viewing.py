@@ -63,19 +63,23 @@ def find_rollouts(runs: Sequence[RunDirectory], wanted: Sequence[str]) -> dict[s
     Raises:
         InputError: When a run has none, or none of a name.
     """
-    found = {}
+    found: dict[str, Rollouts] = {}
+    known: set[str] = set()
     for run in runs:
         there = names(run.rollouts)
         if not there:
             load_rollouts(run.rollouts, "any")  # says that there are none
         here = [name for name in wanted if name in there] if wanted else [run.last_rollouts(there)]
-        missing = [name for name in wanted if name not in there]
-        if (missing and len(runs) == 1) or not here:
-            raise InputError(f"{str(run.path)!r} has no rollouts of {missing[0]!r}: there are {', '.join(there)}")
+        if not here:
+            raise InputError(f"{str(run.path)!r} has no rollouts of {wanted[0]!r}: there are {', '.join(there)}")
+        known.update(there)
         for name in here:
             one = load_rollouts(run.rollouts, name)
-            label = f"{one.agent} on {one.world}" if len(runs) == 1 else f"{run.path.name}: {name}"
+            label = f"{one.agent} on {one.world}" if len(runs) == 1 else f"{run.path}: {name}"
             found[label if label not in found else f"{label} ({name})"] = one
+    for name in wanted:
+        if name not in known:
+            raise InputError(f"no run has rollouts of {name!r}: there are {', '.join(sorted(known))}")
     if len(found) > SIDE_BY_SIDE:
         raise InputError(f"{len(found)} rollouts do not fit side by side: at most {SIDE_BY_SIDE}, see --rollouts")
     return found

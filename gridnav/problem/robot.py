@@ -9,6 +9,9 @@ import numpy as np
 
 from gridnav.problem.types import FloatArray, InputError
 
+LIDAR_HEIGHT_M = 0.182
+"""Of the scan plane of a TurtleBot3 Burger above the floor (ROBOTIS-GIT/turtlebot3, ``burger.urdf``)."""
+
 
 @dataclass(frozen=True)
 class Robot:
