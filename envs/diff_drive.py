@@ -207,18 +207,19 @@ class DiffDriveEnv(RobotEnv[DiffDriveVectorEnv]):
 
     ## Episode start and end
 
-    The task draws start, goal and heading; the robot starts at rest at a cell's centre. ``terminated`` within 0.15 m of
-    the goal's centre, or when the physics diverges (``info["physics_error"]``); a wall refuses commands into it, but
-    for those at less than 15 degrees, until the robot has turned or backed off. ``truncated`` after
-    ``max_episode_steps`` (500 with ``gym.make``: 100 s).
+    The task draws start, goal and heading; the robot starts at rest at a cell's centre, but for ``exploring_starts``.
+    ``terminated`` within 0.15 m of the goal's centre, or when the physics diverges (``info["physics_error"]``); a wall
+    refuses commands into it, but for those at less than 15 degrees, until the robot has turned or backed off.
+    ``truncated`` after ``max_episode_steps`` (500 with ``gym.make``: 100 s).
 
     ## Physics
 
     MuJoCo steps of 25 ms (``timestep_s``), eight to a control period; the bumper is looked at after every 0.1 s.
 
     Args:
-        shared: ``layout``, ``task``, ``reward``, ``render_mode``, ``control_period_s``, ``timestep_s``, ``robot``,
-            ``camera``, ``width``, ``height`` and ``max_episode_steps``, see ``DiffDriveVectorEnv``.
+        shared: ``layout``, ``task``, ``reward``, ``render_mode``, ``control_period_s``, ``exploring_starts``,
+            ``timestep_s``, ``robot``, ``camera``, ``width``, ``height`` and ``max_episode_steps``, see
+            ``DiffDriveVectorEnv``.
     """
 
     metadata: dict[str, Any] = {

@@ -92,14 +92,14 @@ class UnicycleEnv(RobotEnv[UnicycleVectorEnv]):
 
     ## Episode start and end
 
-    The task draws start, goal and heading; the robot starts at a cell's centre. ``terminated`` within 0.15 m of the
-    goal's centre; a wall refuses commands into it, but for those at less than 15 degrees, until
-    the robot has turned or backed off. ``truncated`` after
-    ``max_episode_steps`` (500 with ``gym.make``: 100 s).
+    The task draws start, goal and heading; the robot starts at a cell's centre, but for ``exploring_starts``.
+    ``terminated`` within 0.15 m of the goal's centre; a wall refuses commands into it, but for those at less than 15
+    degrees, until the robot has turned or backed off. ``truncated`` after ``max_episode_steps`` (500 with ``gym.make``:
+    100 s).
 
     Args:
-        shared: ``layout``, ``task``, ``reward``, ``render_mode``, ``control_period_s`` and ``max_episode_steps``, see
-            ``RobotVectorEnv`` and ``NavigationVectorEnv``.
+        shared: ``layout``, ``task``, ``reward``, ``render_mode``, ``control_period_s``, ``exploring_starts`` and
+            ``max_episode_steps``, see ``RobotVectorEnv`` and ``NavigationVectorEnv``.
     """
 
     metadata: dict[str, Any] = {
