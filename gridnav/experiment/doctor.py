@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from gridnav.display.viewer import has_display
 from gridnav.envs import GL_BACK_ENDS, gl_works
 
 PACKAGES = (
     "gridnav", "mujoco", "gymnasium", "numpy", "numba", "scipy", "torch", "stable-baselines3", "safetensors",
-    "rerun-sdk", "matplotlib", "tensorboard", "pygame-ce", "tyro",
+    "rerun-sdk", "matplotlib", "pillow", "imageio-ffmpeg", "tensorboard", "pygame-ce", "tyro",
 )  # fmt: skip
 
 
@@ -88,6 +89,6 @@ def _graphics() -> list[Check]:
 
 
 def _display() -> Check:
-    if sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+    if has_display():
         return Check("display", "present")
     return Check("display", "none: use 'gridnav view RUN --screenshot out.png', or open rollout.rrd where there is one")
