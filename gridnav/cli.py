@@ -286,11 +286,11 @@ class _Episodes:
     """The first episode that did not reach its goal."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class View(_Episodes):
     """Look at a run, or at several side by side, in the Rerun viewer: a window, a browser or a picture."""
 
-    run: Annotated[Path, tyro.conf.Positional] = Path()
+    run: Annotated[Path, tyro.conf.Positional]
     """A run directory."""
     compare: tuple[Path, ...] = ()
     """Other runs, whose same episode is shown beside it."""
@@ -366,11 +366,11 @@ class View(_Episodes):
             open_window(recording)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Video(_Episodes):
     """Film an episode of a run in MuJoCo's picture, as .mp4 or .gif; needs no display."""
 
-    run: Annotated[Path, tyro.conf.Positional] = Path()
+    run: Annotated[Path, tyro.conf.Positional]
     """A run directory."""
     output: Path = Path("episode.mp4")
     """The file to write."""

@@ -40,7 +40,7 @@ from gridnav.problem.geodesic import Geodesic, cell_path
 from gridnav.problem.layout import Layout
 from gridnav.problem.metrics import Episode, Trace
 from gridnav.problem.robot import BURGER, LIDAR_HEIGHT_M, Robot
-from gridnav.problem.types import AnyArray, Cell, FloatArray, InputError
+from gridnav.problem.types import AnyArray, Cell, FloatArray, InputError, IntArray
 
 WALL_HEIGHT_M = 0.25
 OUTER_WALL_M = 0.05
@@ -58,7 +58,7 @@ NOTES_FADE_S = 5.0
 """The headless viewer's notes about itself are gone four seconds after its start."""
 SUM = "#9AA5B1"
 """Colour of the whole return: seen on a light and on a dark background."""
-FIELD_DOTS = 8
+FIELD_DOTS = 4
 """Pixels of the distance field along the side of a cell."""
 STILL_SHARE = 0.05
 """A robot below this share of its top speed stands, or turns on the spot."""
@@ -331,14 +331,15 @@ def _log_robot(recording: rr.RecordingStream, at: str, trace: Trace, layout: Lay
     places = np.column_stack([trace.poses[:, :2], zero])
     _send(recording, at, _times(trace), rr.Transform3D.columns(translation=places, quaternion=turns))
 
-    hit = np.concatenate([[False], trace.hits > 0])[:, None]
-    colours = np.where(hit, _rgba(palette.COLLISION), _rgba(palette.INK))
+    hit = np.concatenate([[False], trace.hits > 0])
+    changes = np.flatnonzero(np.concatenate([[True], hit[1:] != hit[:-1]]))  # a colour stays until the next one
+    colours = np.where(hit[changes, None], _rgba(palette.COLLISION), _rgba(palette.INK))
     body = f"{at}/body"
     if trace.is_on_grid:
         half = GRID_BODY_SHARE * layout.cell_size_m / 2
         box = rr.Boxes3D(half_sizes=[half, half, half / 2], centers=[0, 0, half / 2], fill_mode="solid")
         recording.log(body, box, static=True)
-        _send(recording, body, _times(trace), rr.Boxes3D.columns(colors=colours))
+        _send(recording, body, _times(trace, changes), rr.Boxes3D.columns(colors=colours))
         return
     clear = 2 * robot.wheel_radius_m  # the wheels stand out below
     cylinder = rr.Cylinders3D(
@@ -348,7 +349,7 @@ def _log_robot(recording: rr.RecordingStream, at: str, trace: Trace, layout: Lay
         fill_mode="solid",
     )
     recording.log(body, cylinder, static=True)
-    _send(recording, body, _times(trace), rr.Cylinders3D.columns(colors=colours))
+    _send(recording, body, _times(trace, changes), rr.Cylinders3D.columns(colors=colours))
     arrow = rr.Arrows3D(
         origins=[0, 0, BODY_HEIGHT_M + 0.03],
         vectors=[2.5 * robot.radius_m, 0, 0],
@@ -366,18 +367,22 @@ def _log_wheels(recording: rr.RecordingStream, at: str, trace: Trace, robot: Rob
         [np.zeros((1, 2)), np.cumsum(_wheel_speeds(trace, robot) * np.diff(trace.time_s)[:, None], 0)]
     )
     for number, (name, side) in enumerate((("left", 1), ("right", -1))):
-        # A cylinder stands upright: laid along the axle, y, and then rolled about it.
+        # The wheel's frame has its axle along z: laid along the robot's y, and then rolled about it.
         half = rolled[:, number] / 2
         turns = np.column_stack([np.cos(half), np.sin(half), -np.sin(half), np.cos(half)]) / np.sqrt(2)
-        here = np.tile([0.0, side * robot.wheel_separation_m / 2, robot.wheel_radius_m], (len(half), 1))
-        tyre = rr.Cylinders3D(
-            lengths=[WHEEL_WIDTH_M], radii=[robot.wheel_radius_m], colors=_rgba(palette.WALL), fill_mode="solid"
+        here = [0.0, side * robot.wheel_separation_m / 2, robot.wheel_radius_m]
+        recording.log(f"{at}/{name}", rr.Transform3D.from_fields(translation=here), static=True)
+        _send(recording, f"{at}/{name}", _times(trace), rr.Transform3D.columns(quaternion=turns))
+        # A rod across, a little thicker than the tyre, shows that it turns.
+        across = [0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5)]  # about y, x y z w
+        shape = rr.Cylinders3D(
+            lengths=[WHEEL_WIDTH_M, 1.8 * robot.wheel_radius_m],
+            radii=[robot.wheel_radius_m, 0.55 * WHEEL_WIDTH_M],
+            quaternions=[[0.0, 0.0, 0.0, 1.0], across],
+            colors=[_rgba(palette.WALL), _rgba(palette.FLOOR)],
+            fill_mode="solid",
         )
-        spoke = [0.9 * robot.wheel_radius_m, 0.15 * robot.wheel_radius_m, 0.51 * WHEEL_WIDTH_M]
-        recording.log(f"{at}/{name}/tyre", tyre, static=True)
-        mark = rr.Boxes3D(half_sizes=[spoke], colors=_rgba(palette.FLOOR), fill_mode="solid")
-        recording.log(f"{at}/{name}/mark", mark, static=True)
-        _send(recording, f"{at}/{name}", _times(trace), rr.Transform3D.columns(translation=here, quaternion=turns))
+        recording.log(f"{at}/{name}/shape", shape, static=True)
 
 
 def _wheel_speeds(trace: Trace, robot: Robot) -> FloatArray:
@@ -451,13 +456,9 @@ def _log_states(recording: rr.RecordingStream, at: str, episode: Episode, trace:
     ended = "arrived" if episode.is_success else "physics error" if episode.physics_error else "did not arrive"
     names = [*states, ended]
     changes = [i for i in range(len(names)) if i == 0 or names[i] != names[i - 1]]
-    style = rr.StateConfiguration(values=list(STATES), labels=list(STATES), colors=[_rgba(c) for c in STATES.values()])
+    style = rr.StateConfiguration(values=list(STATES), colors=[_rgba(c) for c in STATES.values()])
     recording.log(at, style, static=True)
-    times = [
-        rr.TimeColumn("sim_time", duration=trace.time_s[changes]),
-        rr.TimeColumn("step", sequence=np.array(changes)),
-    ]
-    _send(recording, at, times, rr.StateChange.columns(state=[names[i] for i in changes]))
+    _send(recording, at, _times(trace, np.array(changes)), rr.StateChange.columns(state=[names[i] for i in changes]))
 
 
 def _states(trace: Trace, robot: Robot) -> list[str]:
@@ -639,7 +640,7 @@ def _eye(layout: Layout, n_views: int) -> rrb.EyeControls3D:
 # ---- Small parts -------------------------------------------------------------------------------
 
 
-def _times(trace: Trace, part: slice = slice(None)) -> list[rr.TimeColumn]:
+def _times(trace: Trace, part: slice | IntArray = slice(None)) -> list[rr.TimeColumn]:
     """Both timelines of the trace's states, or of a part of them."""
     steps = np.arange(len(trace.time_s))
     return [rr.TimeColumn("sim_time", duration=trace.time_s[part]), rr.TimeColumn("step", sequence=steps[part])]
