@@ -30,8 +30,6 @@ from rich.table import Table
 
 from gridnav.agents import OnProgress
 from gridnav.agents import Progress as Learning
-from gridnav.display.figures import save_figure
-from gridnav.display.recording import check_recording
 from gridnav.display.viewer import ViewerError
 from gridnav.envs import RenderingError
 from gridnav.experiment.checkpoint import clear_leftovers
@@ -264,6 +262,8 @@ class Evaluate:
             content: dict[str, Any] = {"results": next(iter(own.values()))} if len(own) == 1 else {"runs": own}
             write_json(self.output, content | ({"across_seeds": [asdict(row) for row in together]} if together else {}))
         if self.figure is not None:
+            from gridnav.display.figures import save_figure  # matplotlib takes a second to import
+
             save_figure(compared_curves(results), self.figure)
         for run, one in results:
             _show(one, None, title=str(run.path) if len(runs) > 1 else "")
@@ -324,6 +324,7 @@ class View(_Episodes):
 
     def _recording(self, folder: Path) -> Path:
         """The recording of what was asked for: the run's own one, or a new one."""
+        from gridnav.display.recording import check_recording
         from gridnav.experiment.viewing import Pick, find_rollouts, record_episode, record_overlay
 
         runs = [RunDirectory.open(path) for path in (self.run, *self.compare)]

@@ -12,12 +12,12 @@ from gridnav.display.curves import (
     success_bars,
 )
 from gridnav.display.mazes import (
-    command_motion,
     episode_strip,
     trajectories,
     value_map,
     visit_counts,
 )
+from gridnav.display.policy_map import command_motion
 from gridnav.display.style import STYLE, save_figure, svg_text
 
 __all__ = [

@@ -20,6 +20,7 @@ from matplotlib.path import Path
 from matplotlib.ticker import EngFormatter, NullFormatter
 
 from gridnav.display import palette
+from gridnav.display.policy_map import command_motion
 from gridnav.display.style import SMALL_PT, STYLE, WIDTH_IN, signed
 from gridnav.problem.grid_mdp import MOVE_HEADINGS_RAD
 from gridnav.problem.layout import Layout
@@ -239,29 +240,6 @@ def _draw_policy(axes: Axes, layout: Layout, directions_rad: FloatArray, speeds:
         axes, layout.to_metres(cells), directions_rad[at], lengths_m,
         pivot="middle", color="white", width=0.009, zorder=4,
     )  # fmt: skip
-
-
-def command_motion(
-    commands: FloatArray, headings_rad: FloatArray | float, *, seconds: float = 1.0, robot: Robot = BURGER
-) -> tuple[FloatArray, FloatArray]:
-    """Where a robot gets by a command: the arrows of a robot's policy.
-
-    Held for a while, a command drives an arc; its chord points half of the turn away from the heading.
-
-    Args:
-        commands: Forward and turning command as fractions of the maxima, shape ``(..., 2)``.
-        headings_rad: Where the robot looks, world frame, one for all or shape ``(...)``.
-        seconds: How long the command is held.
-        robot: Gives the maximum speeds, and clips each wheel at its own.
-
-    Returns:
-        Direction of the way from here to there, radians in the world frame, and the speed as a share of the maximum,
-        in [0, 1], shape ``(...)`` both. Turning in place has no speed, and the direction is the limit of slow driving.
-    """
-    left, right = np.moveaxis(robot.wheel_fractions(commands.reshape(-1, 2)).reshape(commands.shape), -1, 0)
-    forward, turn = (left + right) / 2, (right - left) / 2
-    directions_rad = headings_rad + turn * robot.max_turn_rad_s * seconds / 2
-    return np.where(forward < 0, directions_rad + np.pi, directions_rad), np.abs(forward)
 
 
 @matplotlib.rc_context(STYLE)

@@ -54,8 +54,8 @@ GRID_BODY_SHARE = 0.5
 
 SEND_PATIENCE_S = 1.0
 """How long a viewer may take to accept an episode."""
-NOTES_FADE_S = 5.0
-"""The headless viewer's notes about itself are gone four seconds after its start."""
+NOTES_FADE_S = 6.0
+"""The headless viewer's notes about itself are gone four seconds after its start, which may take two."""
 SUM = "#9AA5B1"
 """Colour of the whole return: seen on a light and on a dark background."""
 FIELD_DOTS = 4
@@ -696,7 +696,7 @@ def screenshot(
     Raises:
         ViewerError: When there is no viewer or no graphics driver, or a view reports an error.
     """
-    path = existing(recording_path)
+    path, faded = existing(recording_path), time.monotonic() + NOTES_FADE_S
     with headless_viewer(window_size) as address:
         client = ViewerClient.connect(address)
         client.open(path.resolve().as_uri())
@@ -705,7 +705,7 @@ def screenshot(
             time_s = _end_s(client)
         client.set_time("sim_time", duration=time_s, play_state="paused")
         client.run_command("ui.toggle_top_panel")
-        picture = _settled_picture(client)
+        picture = _settled_picture(client, faded)
         errors = [
             f"{v.name}: {r.summary}" for v in client.get_state().views for r in v.reports if r.severity == "error"
         ]
@@ -720,9 +720,8 @@ def _end_s(client: ViewerClient) -> float:
     return max(((t.end or 0) / 1e9 for t in timelines if t.name == "sim_time"), default=0.0)
 
 
-def _settled_picture(client: ViewerClient) -> bytes:
+def _settled_picture(client: ViewerClient, faded: float) -> bytes:
     """A PNG of the whole window, once pop-up notes have faded and plots have stopped zooming."""
-    faded = time.monotonic() + NOTES_FADE_S
     picture = client.take_screenshot()
 
     def settled() -> bool:

@@ -9,8 +9,7 @@ import numpy as np
 from gymnasium.spaces import Discrete
 
 from gridnav.agents import Agent, TabularAgent
-from gridnav.display.figures import command_motion
-from gridnav.display.policy_map import PolicyMap
+from gridnav.display.policy_map import PolicyMap, command_motion
 from gridnav.envs import NavigationVectorEnv
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.geodesic import cell_distances
