@@ -9,3 +9,4 @@ python3 start.py ladder --run-dir "$run" --seed 0
 mkdir -p docs
 python3 start.py view "$run" --screenshot docs/ladder.png
 cp "$run/figures/learning.png" docs/
+python3 start.py video "$run" --rollouts q-table-diffdrive --speed 8 --size 400 300 --output docs/robot.gif
