@@ -18,7 +18,7 @@ from PIL import Image
 from rerun.chunk import RrdReader
 
 from gridnav.cli import main
-from gridnav.display.viewer import ViewerError, is_open, web_viewer
+from gridnav.display.viewer import ViewerError, is_open, wait_until, web_viewer
 from gridnav.experiment.rollouts import load_rollouts
 from gridnav.experiment.viewing import Pick
 from gridnav.problem.types import InputError
@@ -183,7 +183,7 @@ def test_the_browser_s_page_is_served_to_this_machine_alone_and_ends_with_the_bl
         assert page in {port for _, port in sockets}
         # 127.0.0.1 and ::1 on a little-endian machine.
         assert {host for host, _ in sockets} <= {"0100007F", "00000000000000000000000001000000"}
-    assert not is_open(page)
+    wait_until(lambda: not is_open(page), "end with the block")
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here (Debian package chromium)")
