@@ -54,8 +54,8 @@ GRID_BODY_SHARE = 0.5
 
 SEND_PATIENCE_S = 1.0
 """How long a viewer may take to accept an episode."""
-NOTES_FADE_S = 6.0
-"""The headless viewer's notes about itself are gone four seconds after its start, which may take two."""
+NOTES_FADE_S = 4.5
+"""The headless viewer's notes about itself are gone four seconds after it answers."""
 SUM = "#9AA5B1"
 """Colour of the whole return: seen on a light and on a dark background."""
 FIELD_DOTS = 4
@@ -696,8 +696,9 @@ def screenshot(
     Raises:
         ViewerError: When there is no viewer or no graphics driver, or a view reports an error.
     """
-    path, faded = existing(recording_path), time.monotonic() + NOTES_FADE_S
+    path = existing(recording_path)
     with headless_viewer(window_size) as address:
+        faded = time.monotonic() + NOTES_FADE_S
         client = ViewerClient.connect(address)
         client.open(path.resolve().as_uri())
         wait_until(lambda: not client.get_state().loading, "load the recording")
