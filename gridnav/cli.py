@@ -428,10 +428,8 @@ class Play:
 
         if not 0 <= self.seed < 2**32:
             raise InputError(f"--seed {self.seed} is outside 0 to 4294967295")
-        if self.run_dir is not None and self.run_dir.exists() and not RunDirectory(self.run_dir).is_fresh:
-            raise InputError(
-                f"run directory {str(self.run_dir)!r} exists and is not empty: name another with --run-dir"
-            )
+        if self.run_dir is not None:
+            RunDirectory(self.run_dir).check_free()  # before anybody drives
         problem = Problem.load(self.layout, self.task, self.reward)
         world = self.env.split("/")[1].removesuffix("-v0")
         episodes = play(problem, world, self.seed)

@@ -8,7 +8,6 @@ import io
 import json
 import pickle
 import shutil
-import signal
 import subprocess
 import sys
 import zipfile
@@ -18,23 +17,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_line import run_cli
 from safetensors.numpy import load_file, save_file
 
-from gridnav.cli import main
 from gridnav.experiment.checkpoint import load_checkpoint
 
 WORDS = ["train", "--layout", "S..\n.#.\n..G", "--budget", "quick", "--checkpoint-s", "0"]
 SMALL = {"q-learning": ["num_envs=4", "visits=8"], "ppo": ["num_envs=8", "n_steps=8", "batch_size=32", "steps=1000"]}
-
-
-def run_cli(*arguments: str) -> int:
-    before = signal.getsignal(signal.SIGTERM)
-    try:
-        with pytest.raises(SystemExit) as leaving:
-            main(arguments)
-    finally:
-        signal.signal(signal.SIGTERM, before)
-    return int(leaving.value.code or 0)
 
 
 @pytest.fixture(scope="module")

@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from command_line import run_cli
 from safetensors.numpy import load_file
 
 from gridnav.agents import Planner, Progress
-from gridnav.cli import main
 from gridnav.experiment.checkpoint import Standing, clear_leftovers, last_standing, load_checkpoint, save_agent
 from gridnav.experiment.course import CHECKPOINT_SHARE, Clock
 from gridnav.experiment.results import evaluation, open_log
@@ -421,16 +421,6 @@ def wait_for(what: Callable[[], object], process: subprocess.Popen[str]) -> None
         assert process.poll() is None, f"it ended by itself: {process.communicate()[1]}"
         assert time.monotonic() < deadline, "it never came so far"
         time.sleep(0.001)
-
-
-def run_cli(*arguments: str) -> int:
-    before = signal.getsignal(signal.SIGTERM)
-    try:
-        with pytest.raises(SystemExit) as leaving:
-            main(arguments)
-    finally:
-        signal.signal(signal.SIGTERM, before)
-    return int(leaving.value.code or 0)
 
 
 def newest(run_dir: Path) -> str:

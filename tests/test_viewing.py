@@ -6,7 +6,6 @@ import contextlib
 import io
 import os
 import shutil
-import signal
 import socket
 import subprocess
 import sys
@@ -14,26 +13,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import run_cli
 from PIL import Image
 from rerun.chunk import RrdReader
 
-from gridnav.cli import main
 from gridnav.display.viewer import ViewerError, is_open, wait_until, web_viewer
 from gridnav.experiment.rollouts import load_rollouts
 from gridnav.experiment.viewing import Pick
 from gridnav.problem.types import InputError
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-
-
-def run_cli(*arguments: str) -> int:
-    before = signal.getsignal(signal.SIGTERM)
-    try:
-        with pytest.raises(SystemExit) as leaving:
-            main(arguments)
-    finally:
-        signal.signal(signal.SIGTERM, before)
-    return int(leaving.value.code or 0)
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from matplotlib.path import Path
 from matplotlib.ticker import EngFormatter, NullFormatter
 
 from gridnav.display import palette
-from gridnav.display.policy_map import command_motion
+from gridnav.display.policy_map import best_moves, command_motion
 from gridnav.display.style import SMALL_PT, STYLE, WIDTH_IN, signed
 from gridnav.problem.grid_mdp import MOVE_HEADINGS_RAD
 from gridnav.problem.layout import Layout
@@ -213,10 +213,9 @@ def value_map(
     """
     shape = layout.walls.shape
     if values.shape != shape:
-        if directions_rad is None:
-            prefers = values.max(axis=1) > values.min(axis=1)
-            directions_rad = np.where(prefers, MOVE_HEADINGS_RAD[values.argmax(axis=1)], np.nan).reshape(shape)
-        values = values.max(axis=1).reshape(shape)
+        best, headings = best_moves(values)
+        values = best.reshape(shape)
+        directions_rad = headings.reshape(shape) if directions_rad is None else directions_rad
     blank = layout.walls.copy()
     blank[goal] = True  # nothing is earned after the goal, so its value means nothing
     figure, axes, _ = _heat_map(layout, np.ma.masked_array(values, blank | np.isnan(values)), label, cmap="viridis")

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gridnav.problem.grid_mdp import MOVE_HEADINGS_RAD
 from gridnav.problem.robot import BURGER, Robot
 from gridnav.problem.types import FloatArray
 
@@ -20,6 +21,20 @@ class PolicyMap:
     """Where the policy heads, world frame (x right, y up); NaN where nowhere."""
     speeds: FloatArray
     """Shares of full speed, in [0, 1]."""
+
+
+def best_moves(action_values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """What the best move from each cell is worth, and where it heads.
+
+    Args:
+        action_values: Of the moves up, down, left, right, shape ``(n_cells, 4)``.
+
+    Returns:
+        Values, and directions in radians, NaN where all four are worth the same; shape ``(n_cells,)`` both.
+    """
+    best = action_values.max(axis=1)
+    prefers = best > action_values.min(axis=1)
+    return best, np.where(prefers, MOVE_HEADINGS_RAD[action_values.argmax(axis=1)], np.nan)
 
 
 def command_motion(

@@ -38,7 +38,7 @@ from gridnav.display.policy_map import PolicyMap
 from gridnav.display.viewer import ViewerError, existing, headless_viewer, wait_until
 from gridnav.problem.geodesic import Geodesic, cell_path
 from gridnav.problem.layout import Layout
-from gridnav.problem.metrics import Episode, Trace
+from gridnav.problem.metrics import STILL_SHARE, Episode, Trace
 from gridnav.problem.robot import BURGER, LIDAR_HEIGHT_M, Robot
 from gridnav.problem.types import AnyArray, Cell, FloatArray, InputError, IntArray
 
@@ -60,8 +60,6 @@ SUM = "#9AA5B1"
 """Colour of the whole return: seen on a light and on a dark background."""
 FIELD_DOTS = 4
 """Pixels of the distance field along the side of a cell."""
-STILL_SHARE = 0.05
-"""A robot below this share of its top speed stands, or turns on the spot."""
 STATES = {
     "driving": palette.BLUE,
     "turning": palette.SKY,
@@ -98,7 +96,7 @@ def write_recording(
     Raises:
         ValueError: When there is no rollout, one without a trace, or one with another start or goal.
     """
-    traces = _traces_of(rollouts)
+    traces = _same_course(rollouts)
     card = _run_card(title, rollouts, properties)
     recording = rr.RecordingStream("gridnav", send_properties=False)
     recording.save(path, default_blueprint=_side_by_side(layout, traces))
@@ -129,7 +127,7 @@ def send_recording(
     """
     recording = rr.RecordingStream("gridnav", send_properties=False)
     recording.connect_grpc(address)
-    recording.send_blueprint(_side_by_side(layout, _traces_of(rollouts)))
+    recording.send_blueprint(_side_by_side(layout, _same_course(rollouts)))
     _log_head(recording, title, None, _run_card(title, rollouts, None))
     _log_rollouts(recording, layout, rollouts, maps, robot)
     # What nobody takes is dropped: a viewer that was closed must not hold training up.
@@ -138,13 +136,19 @@ def send_recording(
     recording.disconnect()
 
 
-def _traces_of(rollouts: Mapping[str, Episode]) -> dict[str, Trace]:
-    traces = {name: episode.trace for name, episode in rollouts.items() if episode.trace is not None}
-    if not rollouts or len(traces) < len(rollouts):
-        raise ValueError(f"a recording needs rollouts, each with a trace: {list(rollouts)} have {len(traces)}")
+def _same_course(rollouts: Mapping[str, Episode]) -> dict[str, Trace]:
+    """The traces of rollouts that share start and goal."""
+    traces = _traces_of(list(rollouts.values()))
     ends = {(episode.start, episode.goal) for episode in rollouts.values()}
     if len(ends) > 1:
         raise ValueError(f"the rollouts of a recording share one start and goal, not {sorted(ends)}")
+    return dict(zip(rollouts, traces, strict=True))
+
+
+def _traces_of(episodes: Sequence[Episode]) -> list[Trace]:
+    traces = [episode.trace for episode in episodes if episode.trace is not None]
+    if not traces or len(traces) < len(episodes):
+        raise ValueError(f"a recording needs episodes, each with a trace: {len(episodes)} have {len(traces)}")
     return traces
 
 
@@ -194,9 +198,7 @@ def write_overlay(
     Raises:
         ValueError: When there is no episode, or one without a trace.
     """
-    traces = [episode.trace for episode in episodes if episode.trace is not None]
-    if not traces or len(traces) < len(episodes):
-        raise ValueError(f"a recording needs episodes, each with a trace: {len(episodes)} have {len(traces)}")
+    traces = _traces_of(episodes)
     card = _overlay_card(title, episodes, properties)
     recording = rr.RecordingStream("gridnav", send_properties=False)
     recording.save(path, default_blueprint=_overlaid(layout))
@@ -391,8 +393,7 @@ def _wheel_speeds(trace: Trace, robot: Robot) -> FloatArray:
     heading = np.unwrap(trace.poses[:, 2])
     middle = (heading[1:] + heading[:-1]) / 2
     forward = (np.diff(trace.poses[:, :2], axis=0) * np.column_stack([np.cos(middle), np.sin(middle)])).sum(axis=1)
-    turn = np.diff(heading) * robot.wheel_separation_m / 2
-    return np.column_stack([forward - turn, forward + turn]) / robot.wheel_radius_m / step_s[:, None]
+    return robot.wheel_turns(forward, np.diff(heading)) / step_s[:, None]
 
 
 def _log_lidar(recording: rr.RecordingStream, at: str, trace: Trace, robot: Robot) -> None:

@@ -9,11 +9,10 @@ import numpy as np
 from gymnasium.spaces import Discrete
 
 from gridnav.agents import Agent, TabularAgent
-from gridnav.display.policy_map import PolicyMap, command_motion
+from gridnav.display.policy_map import PolicyMap, best_moves, command_motion
 from gridnav.envs import NavigationVectorEnv
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.geodesic import cell_distances
-from gridnav.problem.grid_mdp import MOVE_HEADINGS_RAD
 from gridnav.problem.layout import Layout
 from gridnav.problem.types import AnyArray, Cell, FloatArray
 
@@ -53,9 +52,8 @@ def _map_of_moves(
     rank = problem.task.goal_cells(layout).tolist().index(list(goal))
     moves = _move_values(agent, worlds, layout, rank, goal, observation)
     distance = cell_distances(layout, goal).ravel()
-    values = moves.max(axis=1) + problem.reward.potential(np.where(np.isfinite(distance), distance, 0.0))
-    prefers = moves.max(axis=1) > moves.min(axis=1)
-    directions = np.where(prefers, MOVE_HEADINGS_RAD[moves.argmax(axis=1)], np.nan)
+    best, directions = best_moves(moves)
+    values = best + problem.reward.potential(np.where(np.isfinite(distance), distance, 0.0))
     shape = layout.walls.shape
     return PolicyMap(values.reshape(shape), directions.reshape(shape), np.ones(shape))
 

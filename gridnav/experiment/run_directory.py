@@ -65,8 +65,7 @@ class RunDirectory:
         if run._lock.exists():
             with run.own():  # says who owns it, if somebody does
                 pass
-        if run.path.exists() and not run.is_fresh:
-            raise InputError(f"run directory {str(run.path)!r} exists and is not empty: name another with --run-dir")
+        run.check_free()
         run.path.mkdir(parents=True, exist_ok=True)
         with run.own():
             if not run.is_fresh:
@@ -99,6 +98,15 @@ class RunDirectory:
             yield
         finally:
             lock.release()
+
+    def check_free(self) -> None:
+        """Whether a run may begin here.
+
+        Raises:
+            InputError: When the directory exists and is not empty.
+        """
+        if self.path.exists() and not self.is_fresh:
+            raise InputError(f"run directory {str(self.path)!r} exists and is not empty: name another with --run-dir")
 
     @property
     def is_fresh(self) -> bool:

@@ -199,6 +199,8 @@ class Workshop:
         )
         end = course.go(steps)
         worlds.close()
+        if validation is not None:
+            validation.close()
         self._run_steps = end.run_steps
         return Trained(name, course.agent, end.steps, end.seconds, world, choice.observation, course.visits)
 

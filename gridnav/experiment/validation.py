@@ -21,8 +21,8 @@ BEGIN = 0.75
 class Validation:
     """Judges policies at equal distances up to the last one, by the return of greedy episodes.
 
-    What is trained explores, what acts does not, and a policy that is as good as the one before with exploration can
-    press against a wall without: the last one of a training is not always the one to keep.
+    An update can undo what an earlier one learnt for places that are seldom met, and a robot that gets there is stuck:
+    the last policy of a training is not always the one to keep (docs/ppo.md).
 
     Args:
         agent: Who learns.
@@ -63,6 +63,10 @@ class Validation:
             "validation_collision_rate": summary.collision_rate,
             "validation_return": summary.mean_return,
         }
+
+    def close(self) -> None:
+        """Release the environments."""
+        self._worlds.close()
 
     def best(self) -> Agent:
         """The best of those that were judged."""

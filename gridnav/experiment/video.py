@@ -153,8 +153,8 @@ def _between(trace: Trace, robot: Robot, times: FloatArray) -> tuple[FloatArray,
         poses = np.column_stack([np.interp(times, trace.time_s, states[:, axis]) for axis in range(3)])
     middle = states[:-1, 2] if trace.is_on_grid else (states[1:, 2] + states[:-1, 2]) / 2
     ahead = (np.diff(states[:, :2], axis=0) * np.column_stack([np.cos(middle), np.sin(middle)])).sum(axis=1)
-    turned = 0.0 if trace.is_on_grid else np.diff(states[:, 2]) * robot.wheel_separation_m / 2
-    rolled = np.cumsum(np.column_stack([ahead - turned, ahead + turned]) / robot.wheel_radius_m, axis=0)
+    turned = 0.0 if trace.is_on_grid else np.diff(states[:, 2])
+    rolled = np.cumsum(robot.wheel_turns(ahead, turned), axis=0)
     rolled = np.concatenate([np.zeros((1, 2)), rolled])
     return poses, np.column_stack([np.interp(times, trace.time_s, rolled[:, side]) for side in range(2)])
 

@@ -11,7 +11,7 @@ import numpy as np
 from gridnav.display.recording import write_overlay, write_recording
 from gridnav.experiment.rollouts import Rollouts, load_rollouts, names
 from gridnav.experiment.run_directory import RunDirectory
-from gridnav.problem.types import InputError
+from gridnav.problem.types import Cell, InputError
 
 SIDE_BY_SIDE = 4
 """More mazes than these are too small to see anything."""
@@ -93,16 +93,19 @@ def record_episode(path: Path, found: dict[str, Rollouts], pick: Pick) -> None:
     """
     first = next(iter(found.values()))
     number = pick.number(first)
-    layout = first.layout_of(number)
+    layout, ends = first.layout_of(number), _ends(first, number)
     for label, other in found.items():
-        same = len(other.episodes) > number and other.layout_of(number) == layout
-        ends = [(one.episodes[number].start, one.episodes[number].goal) for one in (first, other)] if same else [1, 2]
-        if ends[0] != ends[1]:
+        if len(other.episodes) <= number or other.layout_of(number) != layout or _ends(other, number) != ends:
             raise InputError(f"episode {number} of {label} has another maze, start or goal: they cannot be compared")
     rollouts = {label: one.episodes[number] for label, one in found.items()}
     goal = first.episodes[number].goal
     maps = {label: one.maps[goal] for label, one in found.items() if goal in one.maps}
     write_recording(path, layout, rollouts, maps=maps, title=f"Episode {number}")
+
+
+def _ends(rollouts: Rollouts, number: int) -> tuple[Cell, Cell]:
+    episode = rollouts.episodes[number]
+    return episode.start, episode.goal
 
 
 def record_overlay(path: Path, found: dict[str, Rollouts]) -> None:

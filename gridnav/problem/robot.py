@@ -62,6 +62,19 @@ class Robot:
         """Direction of each beam in the robot frame, shape ``(n_beams,)``."""
         return np.arange(self.n_beams) * (2.0 * np.pi / self.n_beams)
 
+    def wheel_turns(self, ahead_m: FloatArray, turned_rad: FloatArray | float) -> FloatArray:
+        """How far the wheels roll for a motion without slip.
+
+        Args:
+            ahead_m: Way of the axle's centre, shape ``(n,)``, metres.
+            turned_rad: Change of heading, counter-clockwise, radians.
+
+        Returns:
+            Left and right wheel, radians, shape ``(n, 2)``.
+        """
+        aside_m = turned_rad * self.wheel_separation_m / 2
+        return np.column_stack([ahead_m - aside_m, ahead_m + aside_m]) / self.wheel_radius_m
+
     def wheel_fractions(self, actions: FloatArray) -> FloatArray:
         """Wheel speeds for a forward and a turning command.
 
