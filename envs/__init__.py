@@ -13,11 +13,15 @@ from .lidar import scan
 from .mjcf import build_model, build_spec
 from .navigation import NavigationVectorEnv
 from .observation import FeatureVector
+from .randomization import PARAMETERS, Randomization, Range
+from .randomization import PRESETS as RANDOMIZATION_PRESETS
 from .single import NavigationEnv
 from .unicycle import UnicycleEnv, UnicycleVectorEnv
 
 __all__ = [
     "GL_BACK_ENDS",
+    "PARAMETERS",
+    "RANDOMIZATION_PRESETS",
     "DiffDriveEnv",
     "DiffDriveVectorEnv",
     "FeatureVector",
@@ -28,6 +32,8 @@ __all__ = [
     "MoveDriver",
     "NavigationEnv",
     "NavigationVectorEnv",
+    "Randomization",
+    "Range",
     "RenderingError",
     "UnicycleEnv",
     "UnicycleVectorEnv",

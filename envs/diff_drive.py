@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -16,7 +17,8 @@ from gridnav.problem.robot import BURGER, Robot
 from gridnav.problem.types import BoolArray, FloatArray, InputError, IntArray, State
 
 from . import gl
-from .mjcf import build_model
+from .mjcf import build_spec
+from .physics import LONGEST_DELAY_S, Physics
 from .robot_world import GRAZING, SAME_WALL, RobotEnv, RobotVectorEnv
 
 TIMESTEP_S = 0.025
@@ -29,6 +31,7 @@ INTO_WALL = 1e-3
 """Forward command times the cosine of the angle to a wall from which on a command drives into it."""
 LIDAR: dict[str, Any] = {"n_beams": 1, "lidar_range_m": 1.0, "lidar_offset_m": 0.0}
 CAMERAS = ("above", "chase", "onboard")
+EditModel = Callable[[mujoco.MjSpec], None]
 
 
 class DiffDriveVectorEnv(RobotVectorEnv):
@@ -39,6 +42,7 @@ class DiffDriveVectorEnv(RobotVectorEnv):
         robot: The Burger, whose lidar may have other numbers.
         timestep_s: Longest timestep of the physics, seconds; a whole number of timesteps makes a control period.
         n_threads: Threads of the physics, 0 for all cores. The trajectories do not depend on it.
+        edit_model: Changes the model's specification before it is compiled; joints may come after the robot's own.
         camera: The camera of ``rgb_array``: ``above``, ``chase`` or ``onboard``.
         width: Of the picture, pixels.
         height: Of the picture, pixels.
@@ -59,6 +63,7 @@ class DiffDriveVectorEnv(RobotVectorEnv):
         robot: Robot = BURGER,
         timestep_s: float = TIMESTEP_S,
         n_threads: int = 0,
+        edit_model: EditModel | None = None,
         camera: str = "above",
         width: int = 480,
         height: int = 480,
@@ -71,24 +76,34 @@ class DiffDriveVectorEnv(RobotVectorEnv):
         if replace(robot, **LIDAR) != replace(BURGER, **LIDAR):
             raise InputError(f"{robot} is no Burger: the compiled model is, so only the lidar's numbers may differ")
         self._timestep_s, self._n_threads = float(timestep_s), n_threads
+        self._edit_model = edit_model
         self._camera, self._picture_size = camera, (width, height)
         self._renderer: mujoco.Renderer | None = None
         super().__init__(num_envs, robot=robot, **shared)
 
     def _use_layout(self) -> None:
         super()._use_layout()
-        self.model = build_model(self.layout, goal_radius_m=self.task.goal_radius_m)
         n_substeps = int(np.ceil(self.control_period_s / self._timestep_s - 1e-9))
-        self.model.opt.timestep = self.control_period_s / n_substeps
+        timestep_s = self.control_period_s / n_substeps
+        is_late = not {"command_delay_s", "command_jitter_s"}.isdisjoint(self.randomization.names)
+        n_kept = int(np.ceil(LONGEST_DELAY_S / timestep_s)) + 2 if is_late else 0
+        spec = build_spec(self.layout, goal_radius_m=self.task.goal_radius_m, n_kept_commands=n_kept)
+        spec.option.timestep = timestep_s
+        if self._edit_model is not None:
+            self._edit_model(spec)
+        self.model = spec.compile()
         per_look = max(1, int(BUMPER_PERIOD_S / self.model.opt.timestep + 1e-9))
         # How many substeps are made at once between two looks.
         self._looks = [min(per_look, n_substeps - done) for done in range(0, n_substeps, per_look)]
         self._batch = Batch(self.model, self.num_envs, nthread=self._n_threads)
+        self._physics = Physics(self._batch, self.model, self._draws)
+        self._is_late = is_late
         self._qpos, self._qvel, self._ctrl = (self._batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
         self._close_renderer()
 
     def _place(self, ids: IntArray) -> None:
         super()._place(ids)
+        self._physics.apply(ids)
         self._rest(ids)
 
     def _rest(self, ids: IntArray) -> None:
@@ -101,7 +116,9 @@ class DiffDriveVectorEnv(RobotVectorEnv):
         self._qpos[ids, 6] = np.sin(half)
 
     def _roll(self, actions: FloatArray) -> None:
-        wheels, position = self.robot.wheel_fractions(actions), np.empty((self.num_envs, 2))
+        wheels, position = self._wheel_fractions(actions), np.empty((self.num_envs, 2))
+        delays_s = self._commands.delays_s(self._steps) if self._is_late else None
+        self._physics.begin_period(self._steps, self.control_period_s, delays_s, self._qvel)
         for n_substeps in [0, *self._looks]:
             if n_substeps:
                 self._batch.step(nstep=n_substeps)
@@ -155,6 +172,7 @@ class DiffDriveVectorEnv(RobotVectorEnv):
         if "physics" not in state.arrays or state.arrays["physics"].shape != self._batch.state.shape:
             raise InputError(f"the state is not that of {self.num_envs} environments of {self.world}")
         super().set_state(state)
+        self._physics.apply(np.arange(self.num_envs))
         self._batch.state[:] = state.arrays["physics"]
 
     def render(self) -> tuple[Any, ...] | None:
@@ -218,8 +236,8 @@ class DiffDriveEnv(RobotEnv[DiffDriveVectorEnv]):
 
     Args:
         shared: ``layout``, ``task``, ``reward``, ``render_mode``, ``control_period_s``, ``exploring_starts``,
-            ``timestep_s``, ``robot``, ``camera``, ``width``, ``height`` and ``max_episode_steps``, see
-            ``DiffDriveVectorEnv``.
+            ``randomization``, ``timestep_s``, ``robot``, ``camera``, ``width``, ``height`` and ``max_episode_steps``,
+            see ``DiffDriveVectorEnv``.
     """
 
     metadata: dict[str, Any] = {

@@ -145,7 +145,7 @@ def _joined(infos: tuple[dict[str, Any], ...]) -> dict[str, Any]:
     for key in dict.fromkeys(key for info in infos for key in info):
         if key == "final_info":
             joined[key] = _joined(tuple(info.get(key, info) for info in infos))
-        elif key == "reward_terms":
+        elif key in ("reward_terms", "randomization"):
             joined[key] = {name: np.concatenate([info[key][name] for info in infos]) for name in infos[0][key]}
         else:
             n = len(infos[0]["pose"])

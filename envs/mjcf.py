@@ -22,12 +22,13 @@ def build_model(layout: Layout, *, goal_radius_m: float = 0.15) -> mujoco.MjMode
     return build_spec(layout, goal_radius_m=goal_radius_m).compile()
 
 
-def build_spec(layout: Layout, *, goal_radius_m: float = 0.15) -> mujoco.MjSpec:
+def build_spec(layout: Layout, *, goal_radius_m: float = 0.15, n_kept_commands: int = 0) -> mujoco.MjSpec:
     """The Burger on a floor, among the layout's merged walls and an outer wall.
 
     Args:
         layout: The maze.
         goal_radius_m: Radius of the goal mark, a mocap body named ``goal`` that touches nothing.
+        n_kept_commands: Timesteps of commands that the motors keep, so that a delay can be set; with 0 there is none.
 
     Returns:
         What compiles to a model with 9 positions (free joint, left and right wheel), 8 velocities and 2 controls (wheel
@@ -61,6 +62,8 @@ def build_spec(layout: Layout, *, goal_radius_m: float = 0.15) -> mujoco.MjSpec:
         conaffinity=0,
         group=2,
     )
+    for motor in spec.actuators if n_kept_commands else ():
+        motor.nsample = n_kept_commands
     reach = max(width, height)
     world.add_light(
         pos=[width / 2, height / 2, 2 * reach], dir=[0.2, 0.3, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numbers
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -90,8 +90,7 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         robot: Robot = BURGER,
         autoreset: bool = True,
     ) -> None:
-        if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or not 1 <= num_envs <= MAX_ENVS:
-            raise InputError(f"num_envs {num_envs!r} must be a whole number from 1 to {MAX_ENVS}")
+        self.num_envs = checked_num_envs(num_envs)
         if max_episode_steps == -1:  # Gymnasium's word for no limit
             max_episode_steps = None
         if max_episode_steps is not None and max_episode_steps < 1:
@@ -99,7 +98,6 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         modes = self.metadata["render_modes"]
         if render_mode is not None and render_mode not in modes:
             raise InputError(f"render_mode {render_mode!r} is none of {', '.join(modes)}")
-        self.num_envs = int(num_envs)
         self.robot = robot
         self.task, self.reward = Task.load(task), Reward.load(reward)
         self.max_episode_steps = max_episode_steps
@@ -142,6 +140,10 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
     @abstractmethod
     def _spaces(self) -> tuple[gym.Space[Any], gym.Space[Any]]:
         """Observation and action space of one robot."""
+
+    def _vary(self, layout: Layout) -> Layout:
+        """The layout of the episodes that a reset begins; worlds may change it."""
+        return layout
 
     def _use_layout(self) -> None:
         """Build what depends on ``self.layout``; worlds add their own."""
@@ -188,6 +190,7 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         fixed, layout = self._checked_options(options)
         if seed is not None:
             self.use_generators(self._generators(seed))
+        layout = self._vary(layout)
         if layout != self.layout:
             self.layout = layout
             self._use_layout()
@@ -225,7 +228,13 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         arrays |= {f"streams.{name}": array for name, array in streams.arrays.items()}
         fixed = {name: value if np.isscalar(value) else value.tolist() for name, value in self._fixed.items()}
         layout = None if self.layout == self._own_layout else self.layout.to_text()
-        return State(arrays, {"fixed": fixed, "layout": layout, "has_reset": self._has_reset, **streams.values})
+        values = {
+            "fixed": fixed,
+            "layout": layout,
+            "cell_size_m": self.layout.cell_size_m,
+            "has_reset": self._has_reset,
+        }
+        return State(arrays, values | streams.values)
 
     def set_state(self, state: State) -> None:
         """Go on where an environment that was made alike was: what follows is equal bit for bit.
@@ -241,6 +250,7 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         if values["layout"] is not None:  # a text, never a path: the state may come from a file of somebody else
             layout = Layout.from_text(values["layout"], cell_size_m=layout.cell_size_m)
         fixed, layout = self._checked_options({**values["fixed"], "layout": layout})
+        layout = replace(layout, cell_size_m=values["cell_size_m"])
         self._check_state(arrays, layout)
         if layout != self.layout:
             self.layout = layout
@@ -581,6 +591,13 @@ def _begin(
         steps[i] = collisions[i] = 0
         path_length_m[i] = 0.0
         failed[i] = hit[i] = at_goal[i] = False
+
+
+def checked_num_envs(num_envs: Any) -> int:
+    """The number of environments; InputError if it is none."""
+    if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or not 1 <= num_envs <= MAX_ENVS:
+        raise InputError(f"num_envs {num_envs!r} must be a whole number from 1 to {MAX_ENVS}")
+    return int(num_envs)
 
 
 def as_array(action: Any) -> AnyArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -11,9 +12,14 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from gridnav.problem.geodesic import Geodesic, clearances
-from gridnav.problem.types import AnyArray, BoolArray, FloatArray, InputError, IntArray
+from gridnav.problem.layout import Layout
+from gridnav.problem.types import AnyArray, BoolArray, FloatArray, InputError, IntArray, State
 
-from .navigation import NavigationVectorEnv, as_array
+from .draws import Draws
+from .imperfections import Commands, Senses
+from .navigation import NavigationVectorEnv, as_array, checked_num_envs
+from .observation import FeatureVector
+from .randomization import Randomization
 from .single import NavigationEnv, VectorWorld
 
 RELEASE_M = 0.02
@@ -48,13 +54,20 @@ class RobotVectorEnv(NavigationVectorEnv):
         control_period_s: Time between two commands, seconds; 0.2 s is one turn of the lidar (5 Hz).
         exploring_starts: Share of the episodes that begin anywhere, half of them at the nearest wall, whatever the task
             says; for training: a robot that is never put there does not learn how to get away from a wall.
+        randomization: A preset's name, JSON or a ``Randomization``: what varies of robot, senses and maze.
         shared: See ``NavigationVectorEnv``.
     """
 
     STATE = (*NavigationVectorEnv.STATE, "contact", "contact_is_inner", "pressed_s", "begins", "presses")
 
     def __init__(
-        self, num_envs: int = 1, *, control_period_s: float = 0.2, exploring_starts: float = 0.0, **shared: Any
+        self,
+        num_envs: int = 1,
+        *,
+        control_period_s: float = 0.2,
+        exploring_starts: float = 0.0,
+        randomization: str | Randomization = "none",
+        **shared: Any,
     ) -> None:
         if not 0.01 <= control_period_s <= 1.0:
             raise InputError(f"control_period_s {control_period_s} is outside 0.01 to 1 s")
@@ -62,6 +75,9 @@ class RobotVectorEnv(NavigationVectorEnv):
             raise InputError(f"exploring_starts {exploring_starts} is outside 0 to 1")
         self.control_period_s = float(control_period_s)
         self.exploring_starts = float(exploring_starts)
+        self.randomization = Randomization.load(randomization)
+        self._draws = Draws(self.randomization, checked_num_envs(num_envs))
+        self._n_layouts = 0
         super().__init__(num_envs, **shared)
 
     @property
@@ -70,7 +86,8 @@ class RobotVectorEnv(NavigationVectorEnv):
         return self.control_period_s * self.robot.max_speed_m_s / self.layout.cell_size_m
 
     def _spaces(self) -> tuple[gym.Space[Any], gym.Space[Any]]:
-        return self._features.space, Box(-1.0, 1.0, (2,), np.float32)
+        largest = replace(self.layout, cell_size_m=self.layout.cell_size_m * self.randomization.cell_size.high)
+        return FeatureVector(largest, self.robot).space, Box(-1.0, 1.0, (2,), np.float32)
 
     @property
     def release_m(self) -> float:
@@ -81,6 +98,8 @@ class RobotVectorEnv(NavigationVectorEnv):
         super()._use_layout()
         self._geodesic = Geodesic(self.layout, self.robot.radius_m)
         n = self.num_envs
+        self._commands = Commands(self._draws, self.robot, n, self.control_period_s)
+        self._senses = Senses(self._draws, self.robot, n, self.control_period_s)
         self._goal_number = np.zeros(n, dtype=np.int64)
         # Direction of the wall that the bumper met last and has not left, zero without one.
         self._contact: FloatArray = np.zeros((n, 2))
@@ -95,6 +114,8 @@ class RobotVectorEnv(NavigationVectorEnv):
         self._goal_number[ids] = self._geodesic.goal_numbers(self._goal[ids])
         self._contact[ids] = 0.0
         self._pressed_s[ids] = 0.0
+        self._commands.begin(ids)
+        self._senses.begin(ids, self._pose, self._goal_w, self._lidar)
         metres = self._geodesic.distances(self._pose[ids], self._goal_number[ids])
         self._transition.next_distance[ids] = metres / self.layout.cell_size_m
 
@@ -121,8 +142,73 @@ class RobotVectorEnv(NavigationVectorEnv):
         self._start[ids] = self._cell[ids] = np.where(fits, self.layout.to_cell(points), cells)
         self._pose[ids, :2] = np.where(fits, points, self.layout.to_metres(cells))
 
+    def _begin(self, ids: IntArray) -> None:
+        if self.randomization.curriculum:
+            over = ids[self._steps[ids] > 0]
+            self._draws.curriculum.note(over, self._transition.at_goal[over])
+        self._draws.draw(ids)
+        super()._begin(ids)
+
+    def _vary(self, layout: Layout) -> Layout:
+        """The layout of the next episodes: as it is, or with other walls and another size."""
+        varied = self.randomization
+        if not varied.acts_on("layout"):
+            return layout
+        self._n_layouts += 1
+        rng = np.random.default_rng([int(self._draws.keys[0]), self._n_layouts])
+        # Walls: uniform over the whole numbers in the range. Size: uniform.
+        n_walls = int(rng.integers(round(varied.obstacles_moved.low), round(varied.obstacles_moved.high) + 1))
+        size = layout.cell_size_m * rng.uniform(varied.cell_size.low, varied.cell_size.high)
+        return replace(layout.with_moved_walls(n_walls, rng), cell_size_m=size)
+
+    def use_generators(self, generators: list[np.random.Generator]) -> None:
+        """Draw from these generators, one per environment; see ``NavigationVectorEnv.use_generators``."""
+        if any(new is not old for new, old in zip(generators, self._streams.generators, strict=True)):
+            self._draws.use(generators)
+            self._n_layouts = 0
+        super().use_generators(generators)
+
+    def _observe(self, ids: IntArray | None = None) -> AnyArray:
+        senses = self._senses
+        if not senses.is_active:
+            return super()._observe(ids)
+        state = (senses.poses, senses.ranges_m, senses.goals_w, self._speed, self._last_action)
+        return self._features.observe(*(state if ids is None else (part[ids] for part in state)))
+
+    def _info(self, terms: dict[str, FloatArray]) -> dict[str, Any]:
+        info = super()._info(terms)
+        if self._draws.names:
+            info["randomization"] = self._draws.info()
+        return info
+
+    def get_state(self) -> State:
+        """Everything that decides what comes next; see ``NavigationVectorEnv.get_state``."""
+        arrays, values = super().get_state()
+        own = {f"imperfections.{name}": array.copy() for name, array in self._imperfections().items()}
+        return State(arrays | own, values | {"n_layouts": self._n_layouts})
+
+    def set_state(self, state: State) -> None:
+        """Go on where an environment that was made alike was; see ``NavigationVectorEnv.set_state``."""
+        for name, own in self._imperfections().items():
+            stored = state.arrays.get(f"imperfections.{name}")
+            if stored is None or stored.shape != own.shape or stored.dtype != own.dtype:
+                raise InputError(f"{name} of the state does not fit the randomization of these environments")
+        super().set_state(state)
+        for name, own in self._imperfections().items():
+            own[:] = state.arrays[f"imperfections.{name}"]
+        self._n_layouts = int(state.values["n_layouts"])
+
+    def _imperfections(self) -> dict[str, AnyArray]:
+        """Arrays of what was drawn, of commands under way and of what the senses remember."""
+        return {**self._draws.arrays(), **self._commands.arrays(), **self._senses.arrays()}
+
+    def _wheel_fractions(self, actions: FloatArray) -> FloatArray:
+        """Wheel speeds that the motors are told in this period, shape ``(n, 2)``."""
+        return self._commands.moving(self.robot.wheel_fractions(self._commands.pass_on(actions, self._steps)))
+
     def _drive(self, actions: AnyArray) -> None:
         self._roll(actions)
+        self._senses.advance(self._pose, self._steps + 1, self._lidar)
         self._last_action[:] = actions
         step = self._transition
         _judge(

@@ -111,7 +111,7 @@ def _one_info(info: dict[str, Any]) -> dict[str, Any]:
     """The first environment's entries as Python values: numbers, a cell tuple, a pose array."""
     one: dict[str, Any] = {}
     for key, value in info.items():
-        if key == "reward_terms":
+        if key in ("reward_terms", "randomization"):
             one[key] = {name: share.item() for name, share in value.items()}
         elif key == "cell":
             one[key] = tuple(value[0].tolist())

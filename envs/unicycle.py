@@ -9,8 +9,10 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from gridnav.problem.geodesic import clearance
-from gridnav.problem.types import BoolArray, FloatArray
+from gridnav.problem.types import AnyArray, BoolArray, FloatArray, IntArray
 
+from .draws import COLUMN, NOMINAL
+from .imperfections import REMEMBERED
 from .painter import Painter
 from .robot_world import GRAZING, SAME_WALL, RobotEnv, RobotVectorEnv
 
@@ -33,10 +35,11 @@ class UnicycleVectorEnv(RobotVectorEnv):
         super().__init__(num_envs, **shared)
 
     def _roll(self, actions: FloatArray) -> None:
-        robot = self.robot
+        robot, (wheels, turn_factor) = self.robot, self._rolling(actions)
         _roll(
             self._pose,
-            robot.wheel_fractions(actions),
+            wheels,
+            turn_factor,
             robot.max_speed_m_s,
             robot.max_turn_rad_s,
             self.control_period_s,
@@ -52,6 +55,39 @@ class UnicycleVectorEnv(RobotVectorEnv):
             self._presses,
             self._speed,
         )
+
+    def _use_layout(self) -> None:
+        super()._use_layout()
+        self._told: FloatArray = np.zeros((REMEMBERED, self.num_envs, 2))  # wheel fractions, the newest first
+
+    def _place(self, ids: IntArray) -> None:
+        super()._place(ids)
+        self._told[:, ids] = 0.0
+
+    def _imperfections(self) -> dict[str, AnyArray]:
+        return super()._imperfections() | {"told": self._told}
+
+    def _rolling(self, actions: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What the wheels do, as fractions of the nominal robot's maximum, and the factor on how they turn it.
+
+        A delayed command begins within a period: the wheels turn at the mean of what they are told during it.
+        """
+        wheels, draws = self._wheel_fractions(actions), self._draws
+        ones = np.ones(self.num_envs)
+        if self.randomization.acts_on("command"):
+            self._told[1:] = self._told[:-1]
+            self._told[0] = wheels
+            back = np.clip(self._commands.delays_s(self._steps) / self.control_period_s, 0.0, REMEMBERED - 1.000001)
+            newer, ids = back.astype(np.int64), np.arange(self.num_envs)
+            late = (back - newer)[:, None]
+            wheels = (1.0 - late) * self._told[newer, ids] + late * self._told[newer + 1, ids]
+        if not self.randomization.acts_on("drive"):
+            return wheels, ones
+        # The battery bounds the wheels' speed.
+        fastest = draws["battery_v"][:, None] / NOMINAL[COLUMN["battery_v"]]
+        ratio = draws["wheel_radius_ratio"]
+        radius = np.stack([2.0 / (1.0 + ratio), 2.0 * ratio / (1.0 + ratio)], axis=1) * draws["wheel_radius"][:, None]
+        return np.clip(wheels, -fastest, fastest) * radius, 1.0 / draws["wheel_separation"]
 
     def render(self) -> tuple[Any, ...] | None:
         """A picture per environment; the window of ``human`` shows the first."""
@@ -98,7 +134,8 @@ class UnicycleEnv(RobotEnv[UnicycleVectorEnv]):
     100 s).
 
     Args:
-        shared: ``layout``, ``task``, ``reward``, ``render_mode``, ``control_period_s``, ``exploring_starts`` and
+        shared: ``layout``, ``task``, ``reward``, ``render_mode``, ``control_period_s``, ``exploring_starts``,
+            ``randomization`` (what it says of motors, masses and floors does not concern this robot) and
             ``max_episode_steps``, see ``RobotVectorEnv`` and ``NavigationVectorEnv``.
     """
 
@@ -116,6 +153,7 @@ class UnicycleEnv(RobotEnv[UnicycleVectorEnv]):
 def _roll(
     poses: FloatArray,
     wheels: FloatArray,
+    turn_factor: FloatArray,
     max_speed: float,
     max_turn: float,
     period: float,
@@ -136,7 +174,7 @@ def _roll(
     for i in range(len(poses)):
         x, y, heading = poses[i]
         travelled[i], begins[i], presses[i] = 0.0, False, False
-        forward, turning = (wheels[i, 0] + wheels[i, 1]) / 2, (wheels[i, 1] - wheels[i, 0]) / 2
+        forward, turning = (wheels[i, 0] + wheels[i, 1]) / 2, (wheels[i, 1] - wheels[i, 0]) / 2 * turn_factor[i]
         speed, turn = forward * max_speed, turning * max_turn
         # Far from walls one arc does; near them, short ones that look for contact.
         gap, _, _, _ = clearance(x, y, walls, cell)

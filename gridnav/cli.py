@@ -31,7 +31,7 @@ from rich.table import Table
 from gridnav.agents import OnProgress
 from gridnav.agents import Progress as Learning
 from gridnav.display.viewer import ViewerError
-from gridnav.envs import RenderingError
+from gridnav.envs import RANDOMIZATION_PRESETS, RenderingError
 from gridnav.experiment.checkpoint import clear_leftovers
 from gridnav.experiment.course import CHECKPOINT_S
 from gridnav.experiment.run_directory import CONFIG, RunDirectory, read_json, write_json
@@ -76,6 +76,8 @@ class _Run:
     """Starts, goals and what a collision does: default, any or fragile."""
     reward: str = "default"
     """default, fragile (for the task of that name) or seed (the tutorial's)."""
+    randomization: str = "none"
+    """What varies of robots and senses: none, burger, wide, force-only, curriculum, a JSON file or JSON text."""
     seed: int = 0
     """Of everything that is random in training."""
     run_dir: Path | None = None
@@ -103,10 +105,15 @@ class _Run:
             raise InputError(f"--live-port {self.live_port} is outside 0 to 65535")
         if not 0 <= self.checkpoint_s <= 86_400:
             raise InputError(f"--checkpoint-s {self.checkpoint_s} is outside 0 to 86400 seconds")
-        problem = Problem.load(self.layout, self.task, self.reward)
+        problem = Problem.load(self.layout, self.task, self.reward, self.randomization)
         layout = self.layout if self.layout in (*NAMED_LAYOUTS, RANDOM) else problem.layout.to_text()
-        config = asdict(replace(self, layout=layout, **OF_ONE_START))
+        varied = self.randomization
+        if varied not in RANDOMIZATION_PRESETS:
+            varied = json.dumps(problem.randomization.to_json())
+        config = asdict(replace(self, layout=layout, randomization=varied, **OF_ONE_START))
         config = {key: value for key, value in config.items() if key not in OF_ONE_START and value is not None}
+        if varied == "none":
+            del config["randomization"]
         command = {kind: name for name, kind in COMMANDS.items()}[type(self)]
         return problem, json.loads(json.dumps({"command": command, **config}))
 
@@ -236,6 +243,8 @@ class Evaluate:
     """A JSON file for all metrics and one row per episode."""
     figure: Path | None = None
     """A picture, .png or .svg, of the runs' learning curves with intervals over seeds."""
+    randomization: str | None = None
+    """What varies of robots and senses, as for train; what varied in training by default."""
 
     def __call__(self) -> int:
         """Run it."""
@@ -255,7 +264,10 @@ class Evaluate:
             raise InputError(f"--figure {str(self.figure)!r} must end with .png or .svg")
         runs = [RunDirectory.open(path) for path in self.runs]
         with _progress() as on_stage:
-            results = [(run, evaluate_again(run, self.episodes, self.seed, on_stage)) for run in runs]
+            results = [
+                (run, evaluate_again(run, self.episodes, self.seed, on_stage, randomization=self.randomization))
+                for run in runs
+            ]
         together = across_seeds(results) if len(runs) > 1 else []
         if self.output is not None:
             own = {str(run.path): evaluation(one) for run, one in results}

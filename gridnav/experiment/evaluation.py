@@ -124,7 +124,8 @@ def evaluate(
 
 
 def _of_one(info: dict[str, Any], i: int) -> dict[str, Any]:
-    return {key: value[i] for key, value in info.items() if isinstance(value, np.ndarray)}
+    one = {key: value[i] for key, value in info.items() if isinstance(value, np.ndarray)}
+    return one | {"randomization": {name: float(drawn[i]) for name, drawn in info.get("randomization", {}).items()}}
 
 
 def evaluate_in(
@@ -149,6 +150,7 @@ def evaluate_in(
         on_progress: Told how many episodes have ended.
     """
     n_layouts = min(n_episodes, HELD_OUT_LAYOUTS) if problem.family else 1
+    problem = problem.for_evaluation
     layouts = problem.family.held_out(n_layouts) if problem.family else [problem.layout]
     per_layout = n_episodes // n_layouts
     episodes: list[Episode] = []
@@ -236,6 +238,7 @@ class _Course:
             motion=measure_motion(trace, layout, robot),
             behaviours=diagnose(trace, goal_w=layout.to_metres(np.array(goal)), layout=layout, robot=robot),
             layout=layout.name,
+            randomization=info["randomization"],
         )
 
     def _shortest_time(self, shortest_path_m: float, goal: Cell, trace: Trace) -> float:

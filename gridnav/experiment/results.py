@@ -208,7 +208,9 @@ def open_log(run: RunDirectory) -> MetricsLog:
     return MetricsLog(run, last_standing(run.checkpoints).log_bytes)
 
 
-def evaluate_again(run: RunDirectory, episodes: int, seed: int | None, on_stage: OnStage) -> list[Result]:
+def evaluate_again(
+    run: RunDirectory, episodes: int, seed: int | None, on_stage: OnStage, *, randomization: str | None = None
+) -> list[Result]:
     """Evaluate every agent of a finished run anew.
 
     Args:
@@ -216,13 +218,15 @@ def evaluate_again(run: RunDirectory, episodes: int, seed: int | None, on_stage:
         episodes: How many for each.
         seed: Of the episodes; that of every evaluation by default.
         on_stage: Told of every evaluation.
+        randomization: What varies; what varied in training by default.
 
     Raises:
         InputError: When the run holds no evaluation or lacks a checkpoint.
     """
     config, stored = run.read_config(), read_json(run.evaluation)
+    varied = config.get("randomization", "none") if randomization is None else randomization
     try:
-        problem = Problem.load(config["layout"], config["task"], config["reward"])
+        problem = Problem.load(config["layout"], config["task"], config["reward"], varied)
         rows = {name: {key: row[key] for key in _NEEDED} for name, row in stored["results"].items()}
         spent = {name: (row["training_steps"], row["training_seconds"]) for name, row in stored["results"].items()}
     except (KeyError, TypeError, AttributeError) as error:

@@ -175,6 +175,8 @@ def _check(episode: Episode, layout: Layout) -> None:
     numbers = ("episode_return", "path_length_m", "shortest_path_m", "elapsed_s", "collisions", "shortest_time_s")
     if not all(isinstance(getattr(episode, name), int | float) for name in numbers):
         raise ValueError("its rows hold words where numbers should be")
+    if not all(type(value) in (int, float) for value in episode.randomization.values()):
+        raise ValueError("what was drawn for an episode must be numbers")
 
 
 def _cell(pair: Sequence[int]) -> Cell:

@@ -293,7 +293,7 @@ def make_validation(
     n_policies = round(getattr(config, "n_validations", 0) * budget.share)
     if n_policies < 2 or problem.family is not None:
         return None
-    worlds = problem.worlds(world, config.validation_episodes)
+    worlds = problem.for_evaluation.worlds(world, config.validation_episodes)
     try:
         return Validation(agent, worlds, steps, n_policies, saved.validation if saved else None)
     except UNFIT as error:

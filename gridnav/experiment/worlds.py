@@ -7,12 +7,13 @@ from typing import Any
 
 import gymnasium as gym
 
-from gridnav.envs import LayoutMix, NavigationVectorEnv
+from gridnav.envs import PARAMETERS, LayoutMix, NavigationVectorEnv, Randomization
 from gridnav.problem.layout import Layout
 from gridnav.problem.random_layouts import RandomLayouts
 from gridnav.problem.reward import Reward
 from gridnav.problem.task import Task
 
+NOTHING_VARIES = Randomization()
 RANDOM = "random"
 """Name of the family of random layouts, where a layout's name is asked for."""
 
@@ -26,9 +27,11 @@ class Problem:
     reward: Reward
     family: RandomLayouts | None = None
     """Layouts that training draws from; evaluation is in held-out ones, of which ``layout`` is the first."""
+    randomization: Randomization = NOTHING_VARIES
+    """What varies of robots, senses and mazes."""
 
     @classmethod
-    def load(cls, layout: str, task: str, reward: str) -> Problem:
+    def load(cls, layout: str, task: str, reward: str, randomization: str = "none") -> Problem:
         """From names (and a path or text for the layout).
 
         Raises:
@@ -36,7 +39,16 @@ class Problem:
         """
         family = RandomLayouts() if layout == RANDOM else None
         maze = family.held_out(1)[0] if family else Layout.load(layout)
-        return cls(maze, Task.load(task), Reward.load(reward), family)
+        return cls(maze, Task.load(task), Reward.load(reward), family, Randomization.load(randomization))
+
+    @property
+    def for_evaluation(self) -> Problem:
+        """The same with mazes that stay as they are, so that everybody meets the same starts, goals and walls.
+
+        Of a curriculum it is the whole ranges.
+        """
+        of_mazes = [name for name, parameter in PARAMETERS.items() if parameter.acts_on == "layout"]
+        return replace(self, randomization=replace(self.randomization.without(*of_mazes), curriculum=False))
 
     def worlds(
         self,
@@ -48,6 +60,8 @@ class Problem:
         **options: Any,
     ) -> NavigationVectorEnv:
         """Robots that play this problem, in its layout or in another one; other options go to the environments."""
+        if world != "GridWorld":
+            options = {"randomization": self.randomization} | options
         return make_worlds(
             world, num_envs, layout=layout or self.layout, task=self.task, reward=self.reward,
             **_grid_options(world, observation), **options,
@@ -71,7 +85,12 @@ class Problem:
         def worlds(layout: Layout, n: int) -> NavigationVectorEnv:
             return problem.worlds(world, n, observation=observation, layout=layout, **options)
 
-        return worlds(self.layout, num_envs) if self.family is None else LayoutMix(worlds, num_envs, self.family.draw)
+        if self.family is not None:
+            return LayoutMix(worlds, num_envs, self.family.draw)
+        if not on_grid and self.randomization.acts_on("layout"):
+            # Every reset varies the layout, which is this one to begin with.
+            return LayoutMix(worlds, num_envs, lambda _: self.layout)
+        return worlds(self.layout, num_envs)
 
 
 def make_worlds(world: str, num_envs: int, **options: Any) -> NavigationVectorEnv:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -225,6 +225,27 @@ class Layout:
             walls[r, c] = walls[(row + r) // 2, (col + c) // 2] = False
             stack.append((r, c))
         return cls(walls, ~walls, ~walls, cell_size_m, f"maze-{n_rows}x{n_cols}-{seed}")
+
+    def with_moved_walls(self, n: int, rng: np.random.Generator) -> Layout:
+        """A layout in which up to ``n`` wall cells stand elsewhere and the free cells still hang together.
+
+        Starts and goals stay where they are; where every free cell was one, every free cell is one.
+        """
+        walls = self.walls.copy()
+        any_start, any_goal = (bool((mask == ~walls).all()) for mask in (self.starts, self.goals))
+        kept = (self.starts & (not any_start)) | (self.goals & (not any_goal))
+        n_regions = ndimage.label(~walls)[1]
+        for _ in range(n):
+            # From and to: uniform over walls, and over free cells that are neither start nor goal.
+            sources, targets = (rng.permutation(np.argwhere(cells)) for cells in (walls, ~walls & ~kept))
+            for source, target in zip(sources, targets, strict=False):
+                moved = walls.copy()
+                moved[tuple(source)], moved[tuple(target)] = False, True
+                if ndimage.label(~moved)[1] <= n_regions:
+                    walls = moved
+                    break
+        starts, goals = (~walls if any_start else self.starts), (~walls if any_goal else self.goals)
+        return replace(self, walls=walls, starts=starts, goals=goals)
 
     # ---- Cells and metres --------------------------------------------------------------------
 

@@ -99,6 +99,8 @@ class Episode:
     """Share of the time spent in each behaviour of ``gridnav.problem.behaviour``, 0 for what did not last."""
     layout: str = ""
     """Name of the layout."""
+    randomization: dict[str, float] = field(default_factory=dict)
+    """What was drawn for the episode, by quantity, where something varied."""
 
     @property
     def needed_path_m(self) -> float:

@@ -1,0 +1,214 @@
+"""What an episode's randomization comes to: numbers that depend on environment, quantity and episode, on nothing else.
+
+Numbers are counted out, not taken from a stream (SplitMix64, Steele, Lea and Flood 2014, OOPSLA, as a hash of key,
+quantity, episode and count): a quantity that is switched on changes the draws of no other one, no environment those of
+another, and there is no state but the counters.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from gridnav.problem.types import AnyArray, BoolArray, FloatArray, IntArray
+
+from .randomization import PARAMETERS, Randomization
+
+Keys = NDArray[np.uint64]
+NAMES = tuple(PARAMETERS)
+COLUMN = {name: column for column, name in enumerate(NAMES)}
+"""Column of each quantity in what was drawn."""
+NOMINAL: FloatArray = np.array([parameter.nominal for parameter in PARAMETERS.values()])
+BRANCH = 0x6472
+"""Branch of an environment's seed sequence from which its key comes: no other generator uses it."""
+
+WINDOW = 120
+"""Episodes at the ranges' ends after which a curriculum decides."""
+WIDENS, NARROWS = 0.85, 0.6
+"""Success from which on ranges widen, and below which they narrow."""
+STEP = 0.1
+"""Of the strength, at each decision."""
+
+
+class Draws:
+    """What each of ``n`` environments has drawn for its episode.
+
+    Args:
+        randomization: Ranges and laws.
+        n: Environments.
+    """
+
+    def __init__(self, randomization: Randomization, n: int) -> None:
+        self.randomization = randomization
+        self.names = randomization.names
+        self.columns = np.array([COLUMN[name] for name in self.names], dtype=np.int64)
+        ranges = [getattr(randomization, name) for name in self.names]
+        self._is_log = np.array([one.law == "log" for one in ranges], dtype=bool)
+        self._low, self._high = (np.array([getattr(one, end) for one in ranges]) for end in ("low", "high"))
+        self._ids = np.array([name_id(name) for name in self.names], dtype=np.uint64)
+        self.values: FloatArray = np.tile(NOMINAL, (n, 1))
+        """Of every quantity, in its own unit, shape ``(n, len(NAMES))``; nominal where nothing is drawn."""
+        self.keys: Keys = np.zeros(n, dtype=np.uint64)
+        self.episodes = np.zeros(n, dtype=np.int64)
+        self.curriculum = Curriculum.begin(n)
+
+    def use(self, generators: list[np.random.Generator]) -> None:
+        """Take the environments' keys from what their generators were seeded with, without drawing from these."""
+        self.keys[:] = [_key(generator) for generator in generators]
+        self.episodes[:] = 0
+
+    def draw(self, ids: IntArray) -> None:
+        """Draw for the next episode of the given environments."""
+        self.episodes[ids] += 1
+        if not self.names:
+            return
+        shares = np.empty((len(ids), len(self.names)))
+        _shares(self.keys[ids], self._ids, self.episodes[ids], shares)
+        low, high = self._low, self._high
+        if self.randomization.curriculum:
+            strength = self.curriculum.strength_for(ids, self.keys[ids], self.episodes[ids])[:, None]
+            nominal = NOMINAL[self.columns]
+            low, high = nominal + strength * (low - nominal), nominal + strength * (high - nominal)
+        # By the quantity's law: uniform between the ends, or so in its logarithm.
+        safe = np.where(self._is_log, low, 1.0)
+        by_factors = safe * (np.where(self._is_log, high, 1.0) / safe) ** shares
+        self.values[np.ix_(ids, self.columns)] = np.where(self._is_log, by_factors, low + (high - low) * shares)
+
+    def __getitem__(self, name: str) -> FloatArray:
+        """What was drawn of a quantity, a view of shape ``(n,)``."""
+        return self.values[:, COLUMN[name]]
+
+    def shares(self, name: str, counts: IntArray, n: int) -> FloatArray:
+        """Numbers in [0, 1) of this episode for a quantity, shape ``(num_envs, n)``.
+
+        Args:
+            name: The quantity, or what else a number is for.
+            counts: How often each environment asked before in this episode, shape ``(num_envs,)``.
+            n: How many numbers at once.
+        """
+        numbers = np.empty((len(self.keys), n))
+        _fill(self.keys, np.uint64(name_id(name)), self.episodes, counts, False, numbers)
+        return numbers
+
+    def normals(self, name: str, counts: IntArray, n: int) -> FloatArray:
+        """The same as standard normal numbers."""
+        numbers = np.empty((len(self.keys), n))
+        _fill(self.keys, np.uint64(name_id(name)), self.episodes, counts, True, numbers)
+        return numbers
+
+    def arrays(self) -> dict[str, AnyArray]:
+        """Everything that decides what comes next, by name; the arrays themselves."""
+        return {
+            "drawn": self.values,
+            "keys": self.keys,
+            "episodes": self.episodes,
+            "curriculum": self.curriculum.state,
+            "is_at_end": self.curriculum.is_at_end,
+        }
+
+    def info(self) -> dict[str, FloatArray]:
+        """What was drawn, by name, shape ``(n,)`` each; fresh arrays."""
+        return {name: self.values[:, column].copy() for name, column in zip(self.names, self.columns, strict=True)}
+
+
+@dataclass
+class Curriculum:
+    """One strength for all ranges, in [0, 1], that follows the success of episodes at the present strength.
+
+    Half of the episodes are at it, the others anywhere below, so that what was learnt is not forgotten (automatic
+    domain randomisation, OpenAI et al. 2019, arXiv 1910.07113, section 5).
+    """
+
+    state: FloatArray
+    """Strength, and how many of the episodes at it ended and succeeded, shape ``(3,)``."""
+    is_at_end: BoolArray
+    """Environments whose episode is at the present strength, shape ``(n,)``."""
+
+    @classmethod
+    def begin(cls, n: int) -> Curriculum:
+        """With strength 0."""
+        return cls(np.zeros(3), np.zeros(n, dtype=bool))
+
+    @property
+    def strength(self) -> float:
+        """The present one."""
+        return float(self.state[0])
+
+    def note(self, ids: IntArray, successes: BoolArray) -> None:
+        """Take note of episodes that ended; widen or narrow where enough were at the present strength."""
+        counted = self.is_at_end[ids]
+        self.state[1:] += counted.sum(), successes[counted].sum()
+        if self.state[1] >= WINDOW:
+            rate = self.state[2] / self.state[1]
+            change = STEP if rate >= WIDENS else -STEP if rate < NARROWS else 0.0
+            self.state[:] = min(max(self.strength + change, 0.0), 1.0), 0, 0
+            self.is_at_end[:] = False  # what is under way was drawn at another strength
+
+    def strength_for(self, ids: IntArray, keys: Keys, episodes: IntArray) -> FloatArray:
+        """Strength of the next episode of each environment, shape ``(len(ids),)``."""
+        shares = np.empty((len(ids), 2))
+        _shares(keys, np.array([name_id("curriculum"), name_id("strength")], dtype=np.uint64), episodes, shares)
+        self.is_at_end[ids] = shares[:, 0] < 0.5
+        return np.where(self.is_at_end[ids], self.strength, self.strength * shares[:, 1])
+
+
+def name_id(name: str) -> int:
+    """A number that belongs to a name, whatever other names there are."""
+    return zlib.crc32(name.encode())
+
+
+def _key(generator: np.random.Generator) -> int:
+    seeds = generator.bit_generator.seed_seq
+    assert isinstance(seeds, np.random.SeedSequence)
+    branch = np.random.SeedSequence(seeds.entropy, spawn_key=(*seeds.spawn_key, BRANCH))
+    return int(branch.generate_state(1, np.uint64)[0])
+
+
+@numba.njit(cache=True)
+def _mix(number: np.uint64) -> np.uint64:
+    """SplitMix64's finaliser."""
+    number = (number ^ (number >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    number = (number ^ (number >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return number ^ (number >> np.uint64(31))
+
+
+@numba.njit(cache=True)
+def _share(key: np.uint64, name: np.uint64, episode: int, count: int) -> float:
+    """A number in [0, 1) for an environment, a quantity, an episode and a count within it."""
+    golden = np.uint64(0x9E3779B97F4A7C15)
+    number = _mix(key + golden * (name + np.uint64(1)))
+    number = _mix(number + golden * (np.uint64(episode) + np.uint64(1)))
+    number = _mix(number + golden * (np.uint64(count) + np.uint64(1)))
+    return float(number >> np.uint64(11)) * 2.0**-53
+
+
+@numba.njit(cache=True)
+def _normal(key: np.uint64, name: np.uint64, episode: int, count: int) -> float:
+    """A standard normal number (Box and Muller 1958)."""
+    radius = np.sqrt(-2.0 * np.log(1.0 - _share(key, name, episode, 2 * count)))
+    return radius * np.cos(2.0 * np.pi * _share(key, name, episode, 2 * count + 1))
+
+
+@numba.njit(cache=True)
+def _shares(keys: Keys, names: Keys, episodes: IntArray, shares: FloatArray) -> None:
+    for i in range(len(keys)):
+        for k in range(len(names)):
+            shares[i, k] = _share(keys[i], names[k], episodes[i], 0)
+
+
+@numba.njit(cache=True)
+def _fill(
+    keys: Keys, name: np.uint64, episodes: IntArray, counts: IntArray, is_normal: bool, numbers: FloatArray
+) -> None:
+    n = numbers.shape[1]
+    for i in range(len(keys)):
+        for k in range(n):
+            count = counts[i] * n + k
+            if is_normal:
+                numbers[i, k] = _normal(keys[i], name, episodes[i], count)
+            else:
+                numbers[i, k] = _share(keys[i], name, episodes[i], count)
