@@ -159,7 +159,7 @@ class Randomization:
     """Of the estimated heading."""
     odometry_scale: Range = _parameter("x", 1.0, 0.8, 1.2, "sense")
     """Of the estimated way over the true one."""
-    localization_s: Range = _parameter("s", 10.0, 0.5, 1000.0, "sense")
+    localization_s: Range = _parameter("s", 3.0, 0.5, 1000.0, "sense")
     """Time in which the estimated pose falls back to the true one, as a scan matcher's does."""
     position_noise_m: Range = _parameter("m", 0.0, 0.0, 0.5, "sense", "step")
     """Standard deviation of the estimated position, each axis."""

@@ -15,6 +15,7 @@ from gridnav.envs import MoveDriver, NavigationVectorEnv
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.behaviour import diagnose
 from gridnav.problem.geodesic import Geodesic
+from gridnav.problem.layout import Layout
 from gridnav.problem.metrics import Episode, Trace, driving_time, measure_motion
 from gridnav.problem.types import AnyArray, Cell
 
@@ -137,6 +138,7 @@ def evaluate_in(
     observation: str = "cell_goal",
     seed: int = EVALUATION_SEED,
     on_progress: OnProgress | None = None,
+    worlds: Callable[[int, Layout], NavigationVectorEnv] | None = None,
 ) -> list[Episode]:
     """Fixed-seed episodes of an agent in a world, in as many held-out layouts as there can be where there is a family.
 
@@ -148,6 +150,7 @@ def evaluate_in(
         observation: What an agent of the grid sees.
         seed: Of starts, goals and headings.
         on_progress: Told how many episodes have ended.
+        worlds: Makes so many robots in a layout; by default those of the problem.
     """
     n_layouts = min(n_episodes, HELD_OUT_LAYOUTS) if problem.family else 1
     problem = problem.for_evaluation
@@ -155,10 +158,13 @@ def evaluate_in(
     per_layout = n_episodes // n_layouts
     episodes: list[Episode] = []
     for number, layout in enumerate(layouts):
-        worlds = problem.worlds(world, per_layout, observation=observation, layout=layout)
+        if worlds is None:
+            robots = problem.worlds(world, per_layout, observation=observation, layout=layout)
+        else:
+            robots = worlds(per_layout, layout)
         inner = on_progress if n_layouts == 1 else None
-        episodes += evaluate(policy_for(agent, worlds), worlds, seed=seed + number, on_progress=inner)
-        worlds.close()
+        episodes += evaluate(policy_for(agent, robots), robots, seed=seed + number, on_progress=inner)
+        robots.close()
         if on_progress and n_layouts > 1:
             success = float(np.mean([episode.is_success for episode in episodes]))
             on_progress(Progress(len(episodes), n_layouts * per_layout, {"success_rate": success}))
