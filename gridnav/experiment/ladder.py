@@ -15,7 +15,7 @@ from gridnav.experiment.results import (
     write_rollouts,
 )
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
-from gridnav.experiment.training import Budget, Choice, OnStage, Result, Trained, Workshop
+from gridnav.experiment.training import Budget, Choice, OnStage, Result, Trained, Workshop, carry_weights
 from gridnav.experiment.worlds import Problem
 
 QUESTION = (
@@ -69,7 +69,7 @@ def climb(
 
         scratch = workshop.train("ppo-scratch", "ppo", "DiffDrive")
         results.append(workshop.evaluate("ppo-scratch", scratch, "DiffDrive", "PPO from scratch"))
-        warm = workshop.train("ppo-warm", "ppo", "DiffDrive", start=unicycle.agent, choice=Choice("warm"))
+        warm = workshop.train("ppo-warm", "ppo", "DiffDrive", carry=carry_weights(unicycle.agent), choice=Choice("warm"))
         results.append(workshop.evaluate("ppo-warm", warm, "DiffDrive", "PPO warm-started", carried=network))
 
         _write(problem, seed, run, command, config, results, [table, warm], log)
