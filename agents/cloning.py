@@ -42,8 +42,8 @@ def clone(agent: PPOAgent, demonstrations: Demonstrations) -> dict[str, float]:
         demonstrations: By somebody with the same spaces.
 
     Returns:
-        ``action_error``, the root mean square error of the actions, and ``explained_returns``, the share of the returns'
-        variance that the values explain; both in the last pass.
+        ``action_error``, the root mean square error of the actions, and ``explained_returns``, the share of the
+        returns' variance that the values explain; both in the last pass.
 
     Raises:
         NonFiniteError: When a NaN or infinity came up, before it reached the weights.

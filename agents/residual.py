@@ -19,10 +19,10 @@ TABLE = "action_values"
 
 
 class ResidualAgent(PPOAgent):
-    """Its actions are corrections, ``RESIDUAL_SHARE`` of which is added to what a table of the grid would have the robot do.
+    """Its actions are corrections: ``RESIDUAL_SHARE`` of them is added to what a table of the grid has the robot do.
 
-    Who makes commands of the table's moves is no matter of an agent: see ``policy_for``. The untrained policy corrects
-    nothing.
+    How commands are made of the table's moves is no matter of an agent, see ``policy_for``. The untrained policy
+    corrects nothing.
 
     Args:
         observation_space: A ``Box``.

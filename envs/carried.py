@@ -50,10 +50,10 @@ class WrappedWorlds(VectorWrapper[AnyArray, AnyArray, AnyArray, AnyArray, AnyArr
 
 
 class PotentialShaping(WrappedWorlds):
-    """Adds ``gamma * phi(s') - phi(s)`` to the reward: for a learner with that discount the optimal policy stays as it was.
+    """Adds ``gamma * phi(s') - phi(s)`` to the reward, which leaves a learner with that discount its optimal policy.
 
-    ``phi(s')`` is 0 where the task is over and never zeroed where time is (Ng, Harada and Russell 1999; Grzes 2017). The
-    share is ``info["reward_terms"]["potential"]``.
+    ``phi(s')`` is 0 where the task is over and never zeroed where time is (Ng, Harada and Russell 1999; Grzes 2017).
+    The share is ``info["reward_terms"]["potential"]``.
 
     Args:
         env: The worlds, with autoreset in the same step.
@@ -94,9 +94,7 @@ class Corrected(WrappedWorlds):
         share: Of a correction that is added.
     """
 
-    def __init__(
-        self, env: VectorEnv[Any, Any, Any], commands: Callable[[AnyArray], AnyArray], share: float
-    ) -> None:
+    def __init__(self, env: VectorEnv[Any, Any, Any], commands: Callable[[AnyArray], AnyArray], share: float) -> None:
         super().__init__(env)
         self._commands, self._share = commands, share
 

@@ -125,7 +125,9 @@ def ppo_warm(seeds: Sequence[int]) -> None:
     for seed in seeds:
         with _workshop(seed) as (workshop, log):
             unicycle = workshop.train("ppo-unicycle", "ppo", "Unicycle")
-            trained = workshop.train("ppo-warm", "ppo", "DiffDrive", carry=carry_weights(unicycle.agent), choice=Choice("warm"))
+            trained = workshop.train(
+                "ppo-warm", "ppo", "DiffDrive", carry=carry_weights(unicycle.agent), choice=Choice("warm")
+            )
             summary = workshop.evaluate("ppo-warm", trained, "DiffDrive", "ppo-warm").summary
             print(
                 f"seed {seed}: success {summary.success_rate:.1%}, collision rate {summary.collision_rate:.1%}, "

@@ -46,8 +46,6 @@ class Arm:
     """What it builds on, of ``TABLE``, ``NETWORK`` and ``CLONE``."""
     prepare: Callable[[Problem, Sequence[Trained]], Carry] | None
     """What a training takes over, given the problem and the trained sources; none where nothing is learnt."""
-    learner: str = "ppo"
-    """Kind of the agent that learns."""
 
 
 def scratch(problem: Problem, sources: Sequence[Trained]) -> Carry:
@@ -62,7 +60,7 @@ def weights(problem: Problem, sources: Sequence[Trained]) -> Carry:
 
 
 def potential(problem: Problem, sources: Sequence[Trained]) -> Carry:
-    """The table's values as a potential, in place of the distance, whose pay is taken back."""
+    """The table's values as a potential."""
     (table,) = sources
     values = cell_values(problem, table.agent)
 
@@ -184,7 +182,7 @@ class Sources:
 
 
 def cell_values(problem: Problem, agent: Agent) -> FloatArray:
-    """What each cell is worth on the way to each goal, the reward's own shaping taken out; that of the goal at the goal.
+    """What each cell is worth on the way to each goal, the reward's own shaping taken out; at the goal what it pays.
 
     Args:
         problem: Gives maze, goals and reward.
@@ -204,7 +202,7 @@ def cell_values(problem: Problem, agent: Agent) -> FloatArray:
 
 
 def potential_of(worlds: NavigationVectorEnv, values: FloatArray) -> Callable[[AnyArray], FloatArray]:
-    """A potential of observations: the values of cells between their centres, less what the reward pays already.
+    """A potential of observations: the values of the cells, interpolated.
 
     Args:
         worlds: Whose feature vectors are observed.

@@ -14,8 +14,8 @@ STEPS = 400
 """Of each robot: two or three episodes of ``classic``, of which the last one is not seen to its end."""
 EXPLORING_STARTS = 0.5
 NOISE = 0.3
-"""Standard deviation of what is added to the commands, as a fraction of full speed: so the robots get to where a network
-will lead them that is not quite right, and what is demonstrated is the way back (DART, Laskey et al. 2017)."""
+"""Standard deviation of what is added to the commands, as a fraction of full speed: so the robots get to where a
+network that is not quite right will lead them, and the way back is demonstrated (DART, Laskey et al. 2017)."""
 
 
 def demonstrate(
@@ -50,9 +50,7 @@ def demonstrate(
     return Demonstrations(np.concatenate(seen), np.concatenate(done), returns.ravel())
 
 
-def discounted_returns(
-    rewards: FloatArray, terminated: BoolArray, truncated: BoolArray, gamma: float
-) -> FloatArray:
+def discounted_returns(rewards: FloatArray, terminated: BoolArray, truncated: BoolArray, gamma: float) -> FloatArray:
     """Discounted rewards from each step to its episode's end.
 
     Args:

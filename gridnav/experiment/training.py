@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from gridnav.agents import Agent, OnProgress, Planner, QLearning
 from gridnav.display.policy_map import PolicyMap
-from gridnav.envs import LayoutMix, NavigationVectorEnv, WrappedWorlds
+from gridnav.envs import NavigationVectorEnv, WrappedWorlds
 from gridnav.experiment.checkpoint import Checkpoint, Standing, load_checkpoint, save_checkpoint
 from gridnav.experiment.course import CHECKPOINT_S, UNFIT, Course, Worlds, bring_back
 from gridnav.experiment.evaluation import evaluate_in
@@ -235,7 +235,18 @@ class Workshop:
         watch = self._spectator.watch(name, world, choice.observation) if self._spectator else None
         curve = GreedyCurve(self.problem.worlds(world, CURVE_EPISODES), steps) if with_curve else None
         course = Course(
-            name, agent, worlds, validation, before, saved, self._run, self._log, report, self._checkpoint_s, watch, curve
+            name,
+            agent,
+            worlds,
+            validation,
+            before,
+            saved,
+            self._run,
+            self._log,
+            report,
+            self._checkpoint_s,
+            watch,
+            curve,
         )
         end = course.go(steps)
         for used in (worlds, validation, curve):
