@@ -64,9 +64,18 @@ class EpsilonGreedyConfig:
         return self.episodes is not None and episodes >= self.episodes
 
 
-SHARES = {"gamma", "gae_lambda", "epsilon_start", "epsilon_end", "epsilon_decay", "target_success", "exploring_starts"}
+SHARES = {
+    "gamma",
+    "gae_lambda",
+    "epsilon_start",
+    "epsilon_end",
+    "epsilon_decay",
+    "target_success",
+    "exploring_starts",
+    "teacher_share",
+}
 """Hyper-parameters within [0, 1]; whole numbers are at least 1 and other numbers positive unless named below."""
-FROM_ZERO = {"seed", "warm_up", "ent_coef", "n_validations"}
+FROM_ZERO = {"seed", "warm_up", "ent_coef", "n_validations", "critic_only_steps", "teacher_weight"}
 ANY = {"log_std_init", "log_std_final", "initial_forward"}
 
 

@@ -6,8 +6,9 @@ Gymnasium vector environment to their ``VecEnv``, the preset, the stopping rule,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any, Self
 
 import gymnasium as gym
@@ -21,7 +22,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.vec_env import VecEnv
+from torch.distributions import Normal, kl_divergence
 
 from gridnav.problem.types import InputError, State
 
@@ -31,6 +34,8 @@ from .torch_state import guard_gradients, load_optimizer_arrays, optimizer_array
 
 POSE = (27, 28, 29, 30)
 """Where the robots' feature vector holds position and heading in the maze."""
+ACTOR = ("mlp_extractor.policy_net", "action_net", "log_std")
+"""Beginnings of the names of the parameters that decide on actions; the value network has layers of its own."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +85,13 @@ class PPOConfig:
     exploring_starts: float = 0.3
     """Share of the training episodes that begin anywhere, half of them at the nearest wall, and not where the task
     says: a policy that explores less and less gets to know fewer and fewer ways to be stuck, and none out of them."""
+    critic_only_steps: int = 0
+    """Environment steps at the beginning in which the value network alone learns: a policy that comes from elsewhere
+    would be spoilt by the advantages of one that knows nothing of it."""
+    teacher_weight: float = 1.0
+    """Weight of the divergence from the teacher, where there is one, at the beginning (Schmitt et al. 2018)."""
+    teacher_share: float = 0.25
+    """Share of the planned steps over which that weight falls linearly to 0."""
     target_success: float | None = None
     """Training stops once this share of the last 400 episodes arrived; never before its steps are used up if none."""
 
@@ -131,6 +143,8 @@ class PPOAgent(Agent):
                 f"ignored {max(config.ignored)} must be below {observation_space.shape[0]}, the observation's length"
             )
         self.config = config
+        self.teacher: PPOAgent | None = None
+        """Whose policy it is drawn to while it learns, if anybody's; no part of its state."""
         self._observation_space, self._action_space = observation_space, action_space
         # Two threads on these small networks are slower than one, and the thread count is part of the seed.
         torch.set_num_threads(1)
@@ -172,7 +186,7 @@ class PPOAgent(Agent):
         config = self.config
         adapter = Sb3VecEnv(env, config.reward_scale)
         model = PPO(
-            "MlpPolicy",
+            TaughtPolicy if self.teacher else ActorCriticPolicy,
             adapter,
             seed=config.seed,
             n_steps=config.n_steps,
@@ -182,13 +196,15 @@ class PPOAgent(Agent):
             learning_rate=lambda left: config.learning_rate * (0.1 + 0.9 * max(left, 0)) ** config.learning_rate_power,
             gamma=config.gamma,
             gae_lambda=config.gae_lambda,
-            ent_coef=config.ent_coef,
+            ent_coef=1.0 if self.teacher else config.ent_coef,
             # Adam in one call for all weights; the epsilon is stable-baselines3's own.
             policy_kwargs=_policy_options(config) | {"optimizer_kwargs": {"eps": 1e-5, "fused": True}},
             device="cpu",
         )
         model.policy.load_state_dict(self.policy.state_dict())
         self.policy = model.policy  # what is learnt before an interrupt counts too
+        if isinstance(self.policy, TaughtPolicy) and self.teacher is not None:
+            self.policy.teach, self.policy.entropy_weight = partial(gaussian, self.teacher.policy), config.ent_coef
         model.set_logger(Logger(folder=None, output_formats=[]))
         guard_gradients(model.policy.optimizer, lambda: model.num_timesteps)
         between = _BetweenRollouts(adapter, steps, config, on_progress, on_cut)
@@ -233,6 +249,41 @@ def _policy_options(config: PPOConfig) -> dict[str, Any]:
         "features_extractor_class": Inputs,
         "features_extractor_kwargs": {"ignored": config.ignored},
     }
+
+
+def gaussian(policy: ActorCriticPolicy, observations: PyTorchObs) -> Normal:
+    """A policy's actions for observations, each number on its own, shape ``(n, n_actions)``."""
+    distribution = policy.get_distribution(observations).distribution
+    assert isinstance(distribution, Normal)
+    return distribution
+
+
+class TaughtPolicy(ActorCriticPolicy):
+    """A policy that is drawn to a teacher's while it learns: kickstarting (Schmitt et al. 2018, arXiv 1803.03835).
+
+    Stable-baselines3 adds what ``evaluate_actions`` calls entropy to the objective, with a weight that is 1 here: so it
+    is the entropy with its own weight, less the divergence from the teacher with the teacher's.
+    """
+
+    teach: Callable[[PyTorchObs], Normal]
+    """The teacher's actions for observations."""
+    teacher_weight = 0.0
+    """Of the divergence, now."""
+    entropy_weight = 0.0
+
+    def evaluate_actions(
+        self, obs: PyTorchObs, actions: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Values, log-probabilities of the actions, and what is added to the objective, shape ``(n, ...)`` each."""
+        values, log_prob, entropy = super().evaluate_actions(obs, actions)
+        assert entropy is not None
+        bonus = self.entropy_weight * entropy
+        if self.teacher_weight > 0.0:
+            with torch.no_grad():
+                teacher = self.teach(obs)
+            divergence = kl_divergence(gaussian(self, obs), teacher).sum(dim=1)
+            bonus = bonus - self.teacher_weight * divergence
+        return values, log_prob, bonus
 
 
 class Inputs(BaseFeaturesExtractor):
@@ -395,6 +446,8 @@ class _BetweenRollouts(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         self._cap_exploration()
+        self._weigh_the_teacher()
+        self._hold_the_actor()
         self._report()
         if self._on_cut is not None:
             assert isinstance(self.model, PPO)
@@ -409,6 +462,22 @@ class _BetweenRollouts(BaseCallback):
         assert isinstance(log_std, torch.Tensor)
         with torch.no_grad():
             log_std.clamp_(max=cap)
+
+    def _weigh_the_teacher(self) -> None:
+        policy, config = self.model.policy, self._config
+        if isinstance(policy, TaughtPolicy):
+            share = self.model.num_timesteps / max(1.0, config.teacher_share * self._total_steps)
+            policy.teacher_weight = config.teacher_weight * max(0.0, 1.0 - share)
+
+    def _hold_the_actor(self) -> None:
+        if not self._config.critic_only_steps:
+            return
+        policy = self.model.policy
+        assert isinstance(policy, ActorCriticPolicy)
+        learns = self.model.num_timesteps >= self._config.critic_only_steps
+        for name, parameter in policy.named_parameters():
+            if name.startswith(ACTOR):
+                parameter.requires_grad_(learns)
 
     def _report(self) -> None:
         steps, values = self.model.num_timesteps, self.logger.name_to_value

@@ -2,11 +2,12 @@
 
 import gymnasium as gym
 
+from .carried import Corrected, PotentialShaping, WrappedWorlds
 from .diff_drive import DiffDriveEnv, DiffDriveVectorEnv
 from .gl import BACK_ENDS as GL_BACK_ENDS
 from .gl import RenderingError, make_renderer
 from .gl import works as gl_works
-from .grid_moves import GridMoves, MoveDriver
+from .grid_moves import GridMoves, MoveDriver, lead, steer
 from .grid_world import GridWorldEnv, GridWorldVectorEnv
 from .layout_mix import LayoutMix
 from .lidar import scan
@@ -22,6 +23,7 @@ __all__ = [
     "GL_BACK_ENDS",
     "PARAMETERS",
     "RANDOMIZATION_PRESETS",
+    "Corrected",
     "DiffDriveEnv",
     "DiffDriveVectorEnv",
     "FeatureVector",
@@ -32,16 +34,20 @@ __all__ = [
     "MoveDriver",
     "NavigationEnv",
     "NavigationVectorEnv",
+    "PotentialShaping",
     "Randomization",
     "Range",
     "RenderingError",
     "UnicycleEnv",
     "UnicycleVectorEnv",
+    "WrappedWorlds",
     "build_model",
     "build_spec",
     "gl_works",
+    "lead",
     "make_renderer",
     "scan",
+    "steer",
 ]
 
 MAX_EPISODE_STEPS = {"GridWorld": 100, "Unicycle": 500, "DiffDrive": 500}

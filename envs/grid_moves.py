@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.spaces import Discrete
 from gymnasium.utils import RecordConstructorArgs
 
-from gridnav.problem.grid_mdp import MOVES
+from gridnav.problem.grid_mdp import MOVE_HEADINGS_RAD, MOVES
 from gridnav.problem.layout import Layout
 from gridnav.problem.robot import Robot
 from gridnav.problem.types import BoolArray, FloatArray, InputError, IntArray
@@ -22,6 +22,8 @@ FACING_RAD = 0.35
 """Further off the target's direction than this, the robot turns in place before it drives."""
 STALLED_STEPS = 5
 """Control periods without motion after which a move counts as blocked."""
+CUT_CELLS = 0.2
+"""A robot that is led turns the corner this much before a cell's centre; beside a wall it has 0.29 cells to spare."""
 
 
 def steer(poses: FloatArray, targets_w: FloatArray, robot: Robot, period_s: float) -> FloatArray:
@@ -46,6 +48,30 @@ def steer(poses: FloatArray, targets_w: FloatArray, robot: Robot, period_s: floa
     # The faster wheel has no more than full speed to give to both.
     forward = np.where(facing, np.minimum(forward, 1.0 - np.abs(turn)), 0.0)
     return np.stack([forward, turn], axis=1)
+
+
+def lead(poses: FloatArray, moves: IntArray, layout: Layout) -> FloatArray:
+    """Where to steer for on the way of a grid move, from the pose alone and not from what was begun earlier.
+
+    The way is the line through the cell's centre along the move. A robot on it is led a cell ahead, one that is off by
+    ``CUT_CELLS`` or more straight onto it, and the point slides ahead in between.
+
+    Args:
+        poses: x and y in metres and heading in radians, world frame, shape ``(n, 3)``.
+        moves: Of each robot's cell, 0 up, 1 down, 2 left, 3 right, shape ``(n,)``.
+        layout: The maze.
+
+    Returns:
+        Metres, world frame, shape ``(n, 2)``.
+    """
+    centres = layout.to_metres(layout.to_cell(poses[:, :2]))
+    headings = MOVE_HEADINGS_RAD[moves]
+    ways = np.stack([np.cos(headings), np.sin(headings)], axis=1)
+    offsets = poses[:, :2] - centres
+    along = (offsets * ways).sum(axis=1, keepdims=True)
+    aside = np.hypot(*(offsets - along * ways).T)[:, None]
+    ahead = layout.cell_size_m * np.clip(1.0 - aside / (CUT_CELLS * layout.cell_size_m), 0.0, 1.0)
+    return centres + (along + ahead) * ways
 
 
 class MoveDriver:

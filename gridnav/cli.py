@@ -155,10 +155,16 @@ class _Run:
 class Ladder(_Run):
     """Climb from a plan on the grid to a MuJoCo robot and measure every rung."""
 
+    arms: str | None = None
+    """Compare these ways to carry something to the robot instead: scratch,waypoint,potential,clone,kickstart,weights,
+    residual or some of them."""
+
     def __call__(self) -> int:
         """Run it."""
-        from gridnav.experiment.ladder import climb
+        from gridnav.experiment.arms import choose_arms
+        from gridnav.experiment.ladder import climb, compare
 
+        arms = choose_arms(self.arms) if self.arms else {}
         problem, config = self._problem()
         if problem.family is not None:
             raise InputError(
@@ -166,11 +172,11 @@ class Ladder(_Run):
             )
         budget = BUDGETS[self.budget]
         with self._directory("ladder", config) as run, _progress() as on_stage:
-            spectator = self._spectator(problem)
-            results = climb(
-                problem, budget, self.seed, run, _again(run), config, on_stage,
-                checkpoint_s=self.checkpoint_s, spectator=spectator,
-            )  # fmt: skip
+            how: dict[str, Any] = {"checkpoint_s": self.checkpoint_s, "spectator": self._spectator(problem)}
+            if arms:
+                results = compare(problem, budget, self.seed, arms, run, _again(run), config, on_stage, **how)
+            else:
+                results = climb(problem, budget, self.seed, run, _again(run), config, on_stage, **how)
         _show(results, run)
         return 0
 

@@ -25,7 +25,7 @@ from gridnav.agents import Planner, QLearning
 from gridnav.experiment.evaluation import evaluate, policy_for
 from gridnav.experiment.ladder import steps_to
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
-from gridnav.experiment.training import BUDGETS, Choice, Workshop, make_learner
+from gridnav.experiment.training import BUDGETS, Choice, Workshop, carry_weights, make_learner
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.metrics import Summary, summarise
 
@@ -125,7 +125,9 @@ def ppo_warm(seeds: Sequence[int]) -> None:
     for seed in seeds:
         with _workshop(seed) as (workshop, log):
             unicycle = workshop.train("ppo-unicycle", "ppo", "Unicycle")
-            trained = workshop.train("ppo-warm", "ppo", "DiffDrive", start=unicycle.agent, choice=Choice("warm"))
+            trained = workshop.train(
+                "ppo-warm", "ppo", "DiffDrive", carry=carry_weights(unicycle.agent), choice=Choice("warm")
+            )
             summary = workshop.evaluate("ppo-warm", trained, "DiffDrive", "ppo-warm").summary
             print(
                 f"seed {seed}: success {summary.success_rate:.1%}, collision rate {summary.collision_rate:.1%}, "

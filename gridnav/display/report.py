@@ -44,6 +44,20 @@ class Rung:
 
 
 @dataclass(frozen=True)
+class Table:
+    """A table of words beside that of the rungs."""
+
+    title: str
+    """Heading."""
+    columns: Sequence[str]
+    """Their names, the first one that of the rows."""
+    rows: Sequence[Sequence[str]]
+    """As many words each as there are columns."""
+    legend: str
+    """What the columns mean."""
+
+
+@dataclass(frozen=True)
 class Picture:
     """A figure with what it shows."""
 
@@ -64,7 +78,7 @@ class Report:
     conclusion: str
     """What it found, one sentence with numbers."""
     rungs: Sequence[Rung]
-    """Rows of the table, in the order of the ladder."""
+    """Rows of the table, in the order of the ladder; where there are none the page has no such table."""
     pictures: Sequence[Picture] = ()
     """Shown below the table."""
     config: Mapping[str, object] = field(default_factory=dict)
@@ -77,6 +91,8 @@ class Report:
     """The run directory, as a user types it after ``gridnav view``."""
     recording: str = "rollout.rrd"
     """The recording beside the page; empty where there is none."""
+    tables: Sequence[Table] = ()
+    """Further tables, above the pictures."""
 
 
 def write_report(path: str | Path, report: Report) -> None:

@@ -252,6 +252,10 @@ def _agent_class(kind: str) -> type[Agent]:
         from gridnav.agents import PPOAgent  # torch takes seconds to import
 
         return PPOAgent
+    if kind == "residual":
+        from gridnav.agents import ResidualAgent
+
+        return ResidualAgent
     if kind == "dqn":
         from gridnav.agents import DQNAgent
 

@@ -11,8 +11,9 @@ from typing import Any, Self
 import numpy as np
 
 from gridnav.agents import Agent, OnProgress, Progress
-from gridnav.envs import LayoutMix, NavigationVectorEnv
+from gridnav.envs import LayoutMix, NavigationVectorEnv, WrappedWorlds
 from gridnav.experiment.checkpoint import Checkpoint, Standing, save_checkpoint
+from gridnav.experiment.greedy_curve import SUCCESS, GreedyCurve
 from gridnav.experiment.live import Watch
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
 from gridnav.experiment.validation import Validation
@@ -24,6 +25,10 @@ CHECKPOINT_SHARE = 0.01
 """Of the time of a training that its checkpoints may take: where one takes long, the next one waits longer."""
 UNFIT = LookupError, TypeError, ValueError, AttributeError, RuntimeError, OverflowError
 """What comes of a checkpoint whose parts are whole and do not belong together."""
+
+
+Worlds = NavigationVectorEnv | LayoutMix | WrappedWorlds
+"""Where an agent may learn."""
 
 
 class Course:
@@ -41,13 +46,14 @@ class Course:
         report: Told of the progress.
         checkpoint_s: Seconds between two checkpoints; 0 makes one at every opportunity.
         watch: Looks at the agent whenever it likes.
+        curve: Measures its greedy policies, where arms are compared.
     """
 
     def __init__(
         self,
         name: str,
         agent: Agent,
-        worlds: NavigationVectorEnv | LayoutMix,
+        worlds: Worlds,
         validation: Validation | None,
         before: Standing,
         saved: Checkpoint | None,
@@ -56,8 +62,9 @@ class Course:
         report: OnProgress,
         checkpoint_s: float,
         watch: Watch | None = None,
+        curve: GreedyCurve | None = None,
     ) -> None:
-        self._watch = watch
+        self._watch, self._curve = watch, curve
         self._name, self.agent, self._worlds, self._validation = name, agent, worlds, validation
         self._before, self._saved = before, saved
         self._run, self._log, self._report = run, log, report
@@ -65,8 +72,9 @@ class Course:
         self._steps, self._n_cuts = before.steps, 0
         self.visits: IntArray | None = None if saved is None else saved.visits
         """How often a robot was seen in each cell; none in a mix of layouts."""
-        if saved is None and isinstance(worlds, NavigationVectorEnv):
-            self.visits = np.zeros(worlds.layout.walls.shape, dtype=np.int64)
+        self._robots = worlds.unwrapped
+        if saved is None and isinstance(self._robots, NavigationVectorEnv):
+            self.visits = np.zeros(self._robots.layout.walls.shape, dtype=np.int64)
 
     def go(self, steps: int) -> Standing:
         """Train until ``steps`` environment steps are taken in all, and make the last checkpoint.
@@ -92,6 +100,7 @@ class Course:
                     raise
                 words = f"the checkpoint of {self._name!r} does not fit its training: {error!r:.100}"
                 raise InputError(words) from error
+            self._measure()
             if self._validation is not None:
                 self._judge(self._validation)
                 self.agent = self._validation.best()
@@ -119,15 +128,23 @@ class Course:
         # After the checkpoint, for a continued training comes by here again.
         if self._validation is not None and self._validation.is_due(self._steps):
             self._judge(self._validation)
-        if self.visits is not None and isinstance(self._worlds, NavigationVectorEnv):
-            np.add.at(self.visits, tuple(self._worlds.cells.T), 1)
+        self._measure()
+        if self.visits is not None and isinstance(self._robots, NavigationVectorEnv):
+            np.add.at(self.visits, tuple(self._robots.cells.T), 1)
+
+    def _measure(self) -> None:
+        """A point of the curve, if one is due; the log, cut back as the training is, says which ones there are."""
+        measured = self._log.curve(self._name, SUCCESS)[0]
+        if self._curve is not None and self._curve.is_due(self._steps, int(measured[-1]) if measured else -1):
+            self._log.add(self._name, self._steps, self._curve.measure(self.agent))
 
     def _judge(self, validation: Validation) -> None:
         self._log.add(self._name, self._steps, validation.judge())
 
     def _standing(self, *, is_finished: bool) -> Standing:
         before = self._before
-        seconds = before.seconds + time.perf_counter() - self._began
+        looked = 0.0 if self._curve is None else self._curve.seconds
+        seconds = before.seconds + time.perf_counter() - self._began - looked
         run_steps = before.run_steps + self._steps - before.steps
         return Standing(self._steps, seconds, run_steps, self._log.sync(), is_finished)
 
@@ -137,7 +154,7 @@ class Course:
         save_checkpoint(self._run.checkpoints, self._name, checkpoint)
 
 
-def bring_back(worlds: NavigationVectorEnv | LayoutMix, saved: Checkpoint, name: str) -> None:
+def bring_back(worlds: Worlds, saved: Checkpoint, name: str) -> None:
     """Put worlds where a checkpoint left them.
 
     Raises:
@@ -147,8 +164,9 @@ def bring_back(worlds: NavigationVectorEnv | LayoutMix, saved: Checkpoint, name:
         if saved.worlds is None or saved.training is None:
             raise InputError("it holds no training to go on with")
         worlds.set_state(saved.worlds)
-        if saved.visits is not None and isinstance(worlds, NavigationVectorEnv):
-            np.add.at(saved.visits, tuple(worlds.cells.T), 0)  # fails unless it is a map of this layout
+        robots = worlds.unwrapped
+        if saved.visits is not None and isinstance(robots, NavigationVectorEnv):
+            np.add.at(saved.visits, tuple(robots.cells.T), 0)  # fails unless it is a map of this layout
     except UNFIT as error:
         raise InputError(f"the checkpoint of {name!r} does not fit its worlds: {error!r:.100}") from error
 

@@ -11,7 +11,7 @@ from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 
 from gridnav.agents import Agent, OnProgress, Progress, TabularAgent
-from gridnav.envs import MoveDriver, NavigationVectorEnv
+from gridnav.envs import MoveDriver, NavigationVectorEnv, lead, steer
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.behaviour import diagnose
 from gridnav.problem.geodesic import Geodesic
@@ -34,9 +34,22 @@ class PolicyStopped(Exception):  # noqa: N818, no error
 
 
 def policy_for(agent: Agent, worlds: NavigationVectorEnv) -> Policy:
-    """The agent's own actions, or grid moves driven by it where it learnt on the grid and these are robots."""
+    """The agent's own actions; grid moves driven by it where it learnt on the grid and these are robots; or both."""
     on_grid = isinstance(worlds.single_action_space, Discrete)
+    if agent.kind == "residual":
+        return _corrected(agent, worlds)
     return drive_by_moves(agent, worlds) if isinstance(agent, TabularAgent) and not on_grid else agent.act
+
+
+def _corrected(agent: Agent, worlds: NavigationVectorEnv) -> Policy:
+    """Commands of a residual agent's table, with the network's corrections."""
+    from gridnav.agents import RESIDUAL_SHARE, ResidualAgent  # torch takes seconds to import
+
+    assert isinstance(agent, ResidualAgent)
+    commands = follow(agent.moves, worlds)
+    return lambda observations: np.clip(
+        commands(observations) + RESIDUAL_SHARE * agent.act(observations), -1.0, 1.0
+    ).astype(np.float32)
 
 
 def drive_by_moves(agent: Agent, worlds: NavigationVectorEnv) -> Policy:
@@ -66,6 +79,33 @@ def drive_by_moves(agent: Agent, worlds: NavigationVectorEnv) -> Policy:
             driver.begin(due, poses[due], moves)
             started[due] = True
         return driver.commands(poses).astype(np.float32)
+
+    return act
+
+
+def follow(moves_for: Policy, worlds: NavigationVectorEnv) -> Policy:
+    """A policy that drives robots by an agent's grid moves from the feature vector alone, without a memory.
+
+    A network can learn such commands by heart, and corrections can be added to them, for they do not hang on when a
+    move was begun; any number of robots may ask.
+
+    Args:
+        moves_for: Moves for ``cell_goal`` observations.
+        worlds: Of the kind of robots it will drive.
+    """
+    layout, robot, goals = worlds.layout, worlds.robot, worlds.goal_cells
+    period_s: float = worlds.control_period_s  # type: ignore[attr-defined]
+    goal_rank = np.full((layout.n_rows, layout.n_cols), 0)
+    goal_rank[tuple(goals.T)] = np.arange(len(goals))
+
+    def act(observations: NDArray[Any]) -> NDArray[Any]:
+        poses, goals_w = worlds.features.poses_and_goals(observations)
+        cells, goal_cells = layout.to_cell(poses[:, :2]), layout.to_cell(goals_w)
+        number = cells[:, 0] * layout.n_cols + cells[:, 1]
+        moves = moves_for(number * len(goals) + goal_rank[tuple(goal_cells.T)])
+        is_there = (cells == goal_cells).all(axis=1, keepdims=True)  # a table knows no move in the goal's own cell
+        targets = np.where(is_there, layout.to_metres(goal_cells), lead(poses, moves, layout))
+        return steer(poses, targets, robot, period_s).astype(np.float32)
 
     return act
 

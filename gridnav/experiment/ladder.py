@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from gridnav.experiment.arms import TABLE, Arm, Sources
+from gridnav.experiment.greedy_curve import CURVE_EPISODES, SUCCESS, GreedyCurve
 from gridnav.experiment.live import Spectator
 from gridnav.experiment.pictures import pictures
 from gridnav.experiment.results import (
@@ -15,13 +17,17 @@ from gridnav.experiment.results import (
     write_rollouts,
 )
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
-from gridnav.experiment.training import Budget, Choice, OnStage, Result, Trained, Workshop
+from gridnav.experiment.training import Budget, Choice, OnStage, Result, Trained, Workshop, carry_weights
+from gridnav.experiment.transfer import QUESTION as TRANSFER_QUESTION
+from gridnav.experiment.transfer import SCRATCH, transfer_report, write_transfer
 from gridnav.experiment.worlds import Problem
 
 QUESTION = (
     "How far does a table learnt on the grid carry a wheeled robot, and what does a network save that "
     "starts from another one?"
 )
+TARGET = "DiffDrive"
+"""World that arms carry something to."""
 SOLVED = 0.95
 """The share of training episodes from which on a learner counts as there."""
 
@@ -69,11 +75,99 @@ def climb(
 
         scratch = workshop.train("ppo-scratch", "ppo", "DiffDrive")
         results.append(workshop.evaluate("ppo-scratch", scratch, "DiffDrive", "PPO from scratch"))
-        warm = workshop.train("ppo-warm", "ppo", "DiffDrive", start=unicycle.agent, choice=Choice("warm"))
+        warm = workshop.train(
+            "ppo-warm", "ppo", "DiffDrive", carry=carry_weights(unicycle.agent), choice=Choice("warm")
+        )
         results.append(workshop.evaluate("ppo-warm", warm, "DiffDrive", "PPO warm-started", carried=network))
 
         _write(problem, seed, run, command, config, results, [table, warm], log)
     return results
+
+
+def compare(
+    problem: Problem,
+    budget: Budget,
+    seed: int,
+    arms: Mapping[str, Arm],
+    run: RunDirectory,
+    command: str,
+    config: Mapping[str, Any],
+    on_stage: OnStage,
+    *,
+    checkpoint_s: float,
+    spectator: Spectator | None = None,
+) -> list[Result]:
+    """Arms of transfer to the MuJoCo robot side by side, with what they build on, written to a run directory.
+
+    Args:
+        problem: What is to be solved.
+        budget: How much may be spent.
+        seed: Of everything that is random in training.
+        arms: By name.
+        run: Where the files go.
+        command: What makes the run again, for the report.
+        config: The run's configuration, for the report.
+        on_stage: Told of every training and evaluation.
+        checkpoint_s: Seconds between two checkpoints of a training.
+        spectator: Watches every training.
+    """
+    with open_log(run) as log:
+        workshop = Workshop(problem, budget, seed, run, log, on_stage, checkpoint_s=checkpoint_s, spectator=spectator)
+        sources, costs = Sources(workshop), {}
+        trained: dict[str, Trained] = {}
+        for name, arm in arms.items():
+            trained[name] = _train(name, arm, workshop, sources, log)
+            costs[name] = _cost(trained[name], arm, sources)
+        results = [workshop.evaluate(one.name, one, one.world, "source of arms") for one in sources.made.values()]
+        results += [
+            workshop.evaluate(name, trained[name], TARGET, arm.agent, carried=arm.carried) for name, arm in arms.items()
+        ]
+        write_evaluation(run, results, seed, arms=costs)
+        side_by_side = [one for one in results if one.name in (TABLE, "waypoint")] + results[-1:]
+        properties = {"command": command, "training seed": seed, "run": run.path.name}
+        write_rollouts(run, problem, results, side_by_side[:2] + results[-1:], properties)
+        shown = pictures(run, problem, results, list(trained.values())[-1:], {}, log)
+    report = transfer_report([run]) if SCRATCH in arms else None
+    if report is not None:
+        write_transfer(run.figures, report)
+    write_page(
+        run,
+        title=f"Arms of transfer on {problem.layout.name}",
+        question=TRANSFER_QUESTION,
+        conclusion=report.sentence if report else "Without the arm scratch there is nothing to compare with.",
+        rows=report_rows(results, seed),
+        shown=[report.picture, *shown] if report else shown,
+        command=command,
+        config=config,
+        tables=[report.table] if report else [],
+    )
+    return results
+
+
+def _train(name: str, arm: Arm, workshop: Workshop, sources: Sources, log: MetricsLog) -> Trained:
+    """Who acts in the end; its curve is in the log."""
+    made = sources.get(arm.sources)
+    if arm.prepare is not None:
+        carry = arm.prepare(workshop.problem, made)
+        return workshop.train(name, "ppo", TARGET, carry=carry, with_curve=True)
+    if not log.curve(name, SUCCESS)[0]:  # or an earlier process was here
+        curve = GreedyCurve(workshop.problem.worlds(TARGET, CURVE_EPISODES), 1)
+        log.add(name, 0, curve.measure(made[-1].agent))
+        curve.close()
+    return made[-1]
+
+
+def _cost(trained: Trained, arm: Arm, sources: Sources) -> dict[str, Any]:
+    """What an arm cost, on the target and in its sources, for ``evaluation.json``."""
+    made = sources.get(arm.sources)
+    learns = arm.prepare is not None
+    return {
+        "world": TARGET,
+        "steps": trained.steps if learns else 0,
+        "seconds": trained.seconds if learns else 0.0,
+        "source_steps": sum(one.steps for one in made),
+        "source_seconds": sum(one.seconds for one in made),
+    }
 
 
 def _write(

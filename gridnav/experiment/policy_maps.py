@@ -11,6 +11,7 @@ from gymnasium.spaces import Discrete
 from gridnav.agents import Agent, TabularAgent
 from gridnav.display.policy_map import PolicyMap, best_moves, command_motion
 from gridnav.envs import NavigationVectorEnv
+from gridnav.experiment.evaluation import policy_for
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.geodesic import cell_distances
 from gridnav.problem.layout import Layout
@@ -76,13 +77,13 @@ def _move_values(
 
 def _map_of_commands(agent: Agent, worlds: NavigationVectorEnv, goal: Cell) -> PolicyMap:
     """Mean value of a robot at rest over its headings, and where it drives from the heading that it values most."""
-    layout = worlds.layout
+    layout, policy = worlds.layout, policy_for(agent, worlds)
     cells = np.argwhere(~layout.walls)
     headings = np.arange(N_HEADINGS) * 2 * np.pi / N_HEADINGS
     observations = [_features(worlds, layout.to_metres(cells), heading, goal) for heading in headings]
     values = np.stack([agent.values(one) for one in observations])
     ways, speeds = zip(
-        *(command_motion(agent.act(one), heading) for one, heading in zip(observations, headings, strict=True)),
+        *(command_motion(policy(one), heading) for one, heading in zip(observations, headings, strict=True)),
         strict=True,
     )
     best = values.argmax(axis=0), np.arange(len(cells))

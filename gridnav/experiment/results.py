@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gridnav.display.recording import write_recording
-from gridnav.display.report import Picture, Report, Rung, write_report
+from gridnav.display.report import Picture, Report, Rung, Table, write_report
 from gridnav.experiment.checkpoint import LIBRARIES, last_standing, load_agent
 from gridnav.experiment.evaluation import EVALUATION_SEED, HELD_OUT_LAYOUTS, evaluate_in
 from gridnav.experiment.live import Spectator
@@ -26,10 +26,15 @@ _NEEDED = ("world", "agent", "carried", "checkpoint", "observation")
 
 
 def write_evaluation(
-    run: RunDirectory, results: Sequence[Result], seed: int, evaluation_seed: int = EVALUATION_SEED
+    run: RunDirectory,
+    results: Sequence[Result],
+    seed: int,
+    evaluation_seed: int = EVALUATION_SEED,
+    arms: Mapping[str, Any] | None = None,
 ) -> None:
-    """``evaluation.json``: every metric of every rung, and one row per episode."""
-    write_json(run.evaluation, {"seed": seed, "evaluation_seed": evaluation_seed, "results": evaluation(results)})
+    """``evaluation.json``: every metric of every rung, and one row per episode; where there are arms, their cost."""
+    content = {"seed": seed, "evaluation_seed": evaluation_seed, "results": evaluation(results)}
+    write_json(run.evaluation, content | ({} if arms is None else {"arms": arms}))
 
 
 def evaluation(results: Sequence[Result]) -> dict[str, Any]:
@@ -128,6 +133,7 @@ def write_page(
     shown: Sequence[Picture],
     command: str,
     config: Mapping[str, Any],
+    tables: Sequence[Table] = (),
 ) -> None:
     """``report.html``."""
     versions = {name: version(name) for name in LIBRARIES}
@@ -142,6 +148,7 @@ def write_page(
         versions,
         run_dir=str(run.path),
         recording=run.recording.name,
+        tables=tables,
     )
     write_report(run.report, page)
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from gridnav.agents import Agent, OnProgress, Planner, QLearning
 from gridnav.display.policy_map import PolicyMap
-from gridnav.envs import LayoutMix, NavigationVectorEnv
-from gridnav.experiment.checkpoint import Checkpoint, Standing, load_checkpoint
-from gridnav.experiment.course import CHECKPOINT_S, UNFIT, Course, bring_back
+from gridnav.envs import NavigationVectorEnv, WrappedWorlds
+from gridnav.experiment.checkpoint import Checkpoint, Standing, load_checkpoint, save_checkpoint
+from gridnav.experiment.course import CHECKPOINT_S, UNFIT, Course, Worlds, bring_back
 from gridnav.experiment.evaluation import evaluate_in
+from gridnav.experiment.greedy_curve import CURVE_EPISODES, GreedyCurve
 from gridnav.experiment.live import Spectator
 from gridnav.experiment.policy_maps import policy_maps
 from gridnav.experiment.presets import choose_config
@@ -21,6 +23,9 @@ from gridnav.experiment.validation import Validation
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.metrics import Episode, Summary, summarise
 from gridnav.problem.types import Cell, InputError, IntArray
+
+if TYPE_CHECKING:
+    from gridnav.agents import PPOAgent
 
 AgentKind = Literal["plan", "q-learning", "dqn", "ppo"]
 OBSERVATIONS: dict[AgentKind, tuple[str, ...]] = {
@@ -67,6 +72,30 @@ class Choice:
         if kind == "ppo":
             return "layouts" if problem.family else "any" if problem.task.goals == "any" else "default"
         return self.observation if self.observation != "cell_goal" else "default"
+
+
+@dataclass(frozen=True)
+class Carry:
+    """What a training of PPO takes over from others; by default nothing."""
+
+    changes: Mapping[str, str] = field(default_factory=dict)
+    """Hyper-parameters that differ for its sake: values in words, by name."""
+    begin: Callable[[PPOAgent], PPOAgent] | None = None
+    """Makes of an untrained agent the one that begins."""
+    wrap: Callable[[NavigationVectorEnv, PPOAgent], WrappedWorlds] | None = None
+    """Puts the worlds in which the agent learns into a wrapper."""
+    teacher: PPOAgent | None = None
+    """Whom the agent is drawn to."""
+
+
+def carry_weights(source: Agent, **changes: str) -> Carry:
+    """Begin with the weights of another PPO agent of the same shape."""
+
+    def begin(agent: PPOAgent) -> PPOAgent:
+        agent.policy.load_state_dict(source.policy.state_dict())  # type: ignore[attr-defined]
+        return agent
+
+    return Carry(changes, begin)
 
 
 @dataclass(frozen=True)
@@ -158,7 +187,14 @@ class Workshop:
         self._run_steps = 0
 
     def train(
-        self, name: str, kind: AgentKind, world: str, *, start: Agent | None = None, choice: Choice | None = None
+        self,
+        name: str,
+        kind: AgentKind,
+        world: str,
+        *,
+        carry: Carry | None = None,
+        choice: Choice | None = None,
+        with_curve: bool = False,
     ) -> Trained:
         """Train an agent, with checkpoints in the run, or load what an earlier process trained.
 
@@ -166,15 +202,16 @@ class Workshop:
             name: Series of the metrics and name of the checkpoints.
             kind: ``plan``, ``q-learning``, ``dqn`` or ``ppo``.
             world: ``GridWorld``, ``Unicycle`` or ``DiffDrive``.
-            start: A PPO agent whose weights it begins with.
+            carry: What a PPO agent takes over from others.
             choice: Its hyper-parameters and observation.
+            with_curve: Measure its greedy policies on the way, see ``GreedyCurve``.
 
         Raises:
             InputError: When the agent cannot act in that world.
             KeyboardInterrupt: After a checkpoint, when the process was asked to stop.
             NonFiniteError: When a NaN or infinity came up; the last checkpoint is from before.
         """
-        choice = choice or Choice()
+        choice, carry = choice or Choice(), carry or Carry()
         check_fit(kind, world)
         saved = load_checkpoint(self._run.checkpoints, name)
         if saved is not None and saved.standing.is_finished:
@@ -182,7 +219,7 @@ class Workshop:
             there = saved.standing
             return Trained(name, saved.agent, there.steps, there.seconds, world, choice.observation, saved.visits)
         report = self._on_stage(f"training {name}")
-        agent, worlds, steps = make_learner(self.problem, kind, world, self.seed, self.budget, choice, start)
+        agent, worlds, steps = make_learner(self.problem, kind, world, self.seed, self.budget, choice, carry)
         before = Standing(run_steps=self._run_steps)
         if saved is not None:
             if getattr(saved.agent, "config", None) != getattr(agent, "config", None):
@@ -192,17 +229,51 @@ class Workshop:
                 )
             agent, before = saved.agent, saved.standing
             bring_back(worlds, saved, name)
+        if carry.teacher is not None:
+            agent.teacher = carry.teacher  # type: ignore[attr-defined]
         validation = make_validation(self.problem, agent, world, steps, self.budget, saved)
         watch = self._spectator.watch(name, world, choice.observation) if self._spectator else None
+        curve = GreedyCurve(self.problem.worlds(world, CURVE_EPISODES), steps) if with_curve else None
         course = Course(
-            name, agent, worlds, validation, before, saved, self._run, self._log, report, self._checkpoint_s, watch
+            name,
+            agent,
+            worlds,
+            validation,
+            before,
+            saved,
+            self._run,
+            self._log,
+            report,
+            self._checkpoint_s,
+            watch,
+            curve,
         )
         end = course.go(steps)
-        worlds.close()
-        if validation is not None:
-            validation.close()
+        for used in (worlds, validation, curve):
+            if used is not None:
+                used.close()
         self._run_steps = end.run_steps
         return Trained(name, course.agent, end.steps, end.seconds, world, choice.observation, course.visits)
+
+    def keep(self, name: str, world: str, make: Callable[[], tuple[Agent, int, dict[str, float]]]) -> Trained:
+        """An agent that comes about in one go, with a checkpoint in the run, or the one an earlier process made.
+
+        Args:
+            name: Name of its metrics and of its checkpoint.
+            world: Where it has its experience from.
+            make: Gives the agent, the environment steps that it took, and metrics.
+        """
+        saved = load_checkpoint(self._run.checkpoints, name)
+        if saved is None:
+            self._on_stage(f"making {name}")
+            began = time.perf_counter()
+            agent, steps, metrics = make()
+            self._log.add(name, steps, metrics)
+            seconds, run_steps = time.perf_counter() - began, self._run_steps + steps
+            saved = Checkpoint(agent, Standing(steps, seconds, run_steps, self._log.sync(), True), None, None)
+            save_checkpoint(self._run.checkpoints, name, saved)
+        self._run_steps = saved.standing.run_steps
+        return Trained(name, saved.agent, saved.standing.steps, saved.standing.seconds, world)
 
     def evaluate(self, name: str, trained: Trained, world: str, agent: str, *, carried: str = "") -> Result:
         """Fixed-seed episodes of an agent in a world; an agent of the grid drives robots by grid moves.
@@ -233,8 +304,8 @@ def make_learner(
     seed: int,
     budget: Budget,
     choice: Choice,
-    start: Agent | None = None,
-) -> tuple[Agent, NavigationVectorEnv | LayoutMix, int]:
+    carry: Carry | None = None,
+) -> tuple[Agent, Worlds, int]:
     """An agent that has not learnt yet, the environments it learns in, and for how many steps.
 
     Args:
@@ -244,14 +315,16 @@ def make_learner(
         seed: Of everything that is random in training.
         budget: How much may be spent.
         choice: Its hyper-parameters and observation.
-        start: A PPO agent whose weights it begins with.
+        carry: What a PPO agent takes over from others.
 
     Raises:
         InputError: When a preset or hyper-parameter is unknown, or a value is not possible.
     """
     if kind == "plan":
         return Planner.solve(problem.layout, problem.task, problem.reward), problem.worlds(world, 1), 0
-    config = choose_config(kind, choice.preset_of(kind, problem), {"seed": str(seed), **choice.changes})
+    carry = carry or Carry()
+    changes = {"seed": str(seed), **carry.changes, **choice.changes}
+    config = choose_config(kind, choice.preset_of(kind, problem), changes)
     worlds = problem.training_worlds(
         world, config.num_envs, observation=choice.observation, exploring_starts=config.exploring_starts
     )
@@ -261,14 +334,16 @@ def make_learner(
         return table, worlds, table.planned_steps
     from gridnav.agents import DQNAgent, PPOAgent  # torch takes seconds to import
 
-    agent: DQNAgent | PPOAgent
     if kind == "dqn":
-        agent = DQNAgent(*spaces, config)
-    else:
-        agent = PPOAgent(*spaces, config)
-        if isinstance(start, PPOAgent):
-            agent.policy.load_state_dict(start.policy.state_dict())
-    return agent, worlds, int(agent.planned_steps * budget.share)
+        deep = DQNAgent(*spaces, config)
+        return deep, worlds, int(deep.planned_steps * budget.share)
+    agent = PPOAgent(*spaces, config)
+    if carry.begin is not None:
+        agent = carry.begin(agent)
+    steps = int(agent.planned_steps * budget.share)
+    if carry.wrap is not None and isinstance(worlds, NavigationVectorEnv):
+        return agent, carry.wrap(worlds, agent), steps
+    return agent, worlds, steps
 
 
 def make_validation(

@@ -8,7 +8,7 @@ import numpy as np
 
 from gridnav.agents import Agent
 from gridnav.envs import NavigationVectorEnv
-from gridnav.experiment.evaluation import evaluate
+from gridnav.experiment.evaluation import evaluate, policy_for
 from gridnav.problem.metrics import summarise
 from gridnav.problem.types import State
 
@@ -54,7 +54,7 @@ class Validation:
 
     def judge(self) -> dict[str, float]:
         """Keep the agent as it is if none before was better; the metrics of its episodes."""
-        summary = summarise(evaluate(self._agent.act, self._worlds, seed=VALIDATION_SEED))
+        summary = summarise(evaluate(policy_for(self._agent, self._worlds), self._worlds, seed=VALIDATION_SEED))
         self._n_judged += 1
         if summary.mean_return >= self._best_return:
             self._best, self._best_return = self._agent.state(), summary.mean_return
