@@ -18,12 +18,14 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import tyro
+from joblib import cpu_count
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -35,15 +37,8 @@ from gridnav.envs import RANDOMIZATION_PRESETS, RenderingError
 from gridnav.experiment.checkpoint import clear_leftovers
 from gridnav.experiment.course import CHECKPOINT_S
 from gridnav.experiment.run_directory import CONFIG, RunDirectory, read_json, write_json
-from gridnav.experiment.training import (
-    BUDGETS,
-    OBSERVATIONS,
-    BudgetName,
-    Choice,
-    OnStage,
-    Result,
-    check_choice,
-)
+from gridnav.experiment.training import BUDGETS, BudgetName, OnStage, Result
+from gridnav.experiment.trials import Training
 from gridnav.experiment.worlds import RANDOM, Problem
 from gridnav.problem.layout import NAMED_LAYOUTS, Layout
 from gridnav.problem.reward import Reward
@@ -53,6 +48,7 @@ from gridnav.problem.types import InputError, NonFiniteError
 if TYPE_CHECKING:
     from gridnav.experiment.across_seeds import AcrossSeeds
     from gridnav.experiment.live import Spectator
+    from gridnav.experiment.sweep import Outcome, Trial
 
 Config = TypeVar("Config")
 stderr = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -126,29 +122,33 @@ class _Run:
 
         return Spectator(problem, address_of(self.live_port or open_empty_window()), self.live_s)
 
-    @contextlib.contextmanager
-    def _directory(self, name: str, config: dict[str, Any]) -> Iterator[RunDirectory]:
-        """The run's directory, this process's own: a new one, or the one to go on with."""
-        if not self.resume or self.run_dir is None or not (self.run_dir / CONFIG).is_file():
-            if self.resume and self.run_dir is None:
-                raise InputError("--resume needs --run-dir: the run to go on with")
-            if self.resume:
-                stderr.print(f"nothing to resume in {str(self.run_dir)!r}: starting from the beginning", markup=False)
-            with RunDirectory.create(self.run_dir, name, config) as run:
-                yield run
-            return
-        run = RunDirectory.open(self.run_dir)
-        stored = run.read_config()
-        for key in stored.keys() | config.keys():
-            if stored.get(key) != config.get(key):
-                flag = f"--{key.replace('_', '-')}"
-                raise InputError(
-                    f"{flag} {config.get(key)!r:.60} is not what {str(self.run_dir)!r} was begun with "
-                    f"({stored.get(key)!r:.60}): leave it out, or begin another run"
-                )
-        with run.own():
-            clear_leftovers(run.checkpoints)
+    def _directory(self, name: str, config: dict[str, Any]) -> contextlib.AbstractContextManager[RunDirectory]:
+        return _directory(self.run_dir, self.resume, name, config)
+
+
+@contextlib.contextmanager
+def _directory(path: Path | None, resume: bool, name: str, config: dict[str, Any]) -> Iterator[RunDirectory]:
+    """The run's directory, this process's own: a new one, or the one to go on with."""
+    if not resume or path is None or not (path / CONFIG).is_file():
+        if resume and path is None:
+            raise InputError("--resume needs --run-dir: the run to go on with")
+        if resume:
+            stderr.print(f"nothing to resume in {str(path)!r}: starting from the beginning", markup=False)
+        with RunDirectory.create(path, name, config) as run:
             yield run
+        return
+    run = RunDirectory.open(path)
+    stored = run.read_config()
+    for key in stored.keys() | config.keys():
+        if stored.get(key) != config.get(key):
+            flag = f"--{key.replace('_', '-')}"
+            raise InputError(
+                f"{flag} {config.get(key)!r:.60} is not what {str(path)!r} was begun with "
+                f"({stored.get(key)!r:.60}): leave it out, or begin another run"
+            )
+    with run.own():
+        clear_leftovers(run.checkpoints)
+        yield run
 
 
 @dataclass(frozen=True)
@@ -159,17 +159,26 @@ class Ladder(_Run):
     """Compare these ways to carry something to the robot instead: scratch,waypoint,potential,clone,kickstart,weights,
     residual or some of them."""
 
-    def __call__(self) -> int:
-        """Run it."""
+    def checked(self) -> tuple[Problem, dict[str, Any]]:
+        """The problem, and the configuration as JSON values that need no other file, once all is known to be right."""
         from gridnav.experiment.arms import choose_arms
-        from gridnav.experiment.ladder import climb, compare
 
-        arms = choose_arms(self.arms) if self.arms else {}
+        if self.arms:
+            choose_arms(self.arms)
         problem, config = self._problem()
         if problem.family is not None:
             raise InputError(
                 "the ladder needs one maze: its plan and its table are of one; train ppo on random layouts"
             )
+        return problem, config
+
+    def __call__(self) -> int:
+        """Run it."""
+        from gridnav.experiment.arms import choose_arms
+        from gridnav.experiment.ladder import climb, compare
+
+        problem, config = self.checked()
+        arms = choose_arms(self.arms) if self.arms else {}
         budget = BUDGETS[self.budget]
         with self._directory("ladder", config) as run, _progress() as on_stage:
             how: dict[str, Any] = {"checkpoint_s": self.checkpoint_s, "spectator": self._spectator(problem)}
@@ -196,36 +205,26 @@ class Train(_Run):
     set: tuple[str, ...] = ()
     """Hyper-parameters that differ from the preset, such as double=false batch_size=64."""
 
+    def checked(self) -> tuple[Problem, dict[str, Any]]:
+        """The problem, and the configuration as JSON values that need no other file, once all is known to be right."""
+        problem, config = self._problem()
+        Training.of(config, problem)
+        return problem, config
+
     def __call__(self) -> int:
         """Run it."""
         from gridnav.experiment.results import train_and_report
 
-        kinds = [kind for kind, seen in OBSERVATIONS.items() if self.observation in seen]
-        if self.agent != "all":
-            kinds = [self.agent]
-        world = self.env.split("/")[1].removesuffix("-v0") if self.env else _home(self.agent)
-        problem, config = self._problem()
-        choice = Choice(self.preset, self._changes(), self.observation)
-        check_choice(kinds, problem, world, choice)
-        budget = BUDGETS[self.budget]
+        problem, config = self.checked()
+        job = Training.of(config, problem)
         with self._directory(f"train-{self.agent}", config) as run, _progress() as on_stage:
             spectator = self._spectator(problem)
             results = train_and_report(
-                problem, budget, self.seed, kinds, world, choice, run, _again(run), config, on_stage,
+                problem, job.budget, self.seed, job.kinds, job.world, job.choice, run, _again(run), config, on_stage,
                 checkpoint_s=self.checkpoint_s, spectator=spectator,
             )  # fmt: skip
         _show(results, run)
         return 0
-
-    def _changes(self) -> dict[str, str]:
-        """The pairs of ``--set``."""
-        changes = {}
-        for pair in self.set:
-            name, equals, value = pair.partition("=")
-            if not equals or name == "seed":
-                raise InputError(f"--set {pair!r:.60} must be name=value, and the seed is --seed")
-            changes[name] = value
-        return changes
 
 
 OF_ONE_START: dict[str, Any] = {
@@ -233,6 +232,80 @@ OF_ONE_START: dict[str, Any] = {
     "live_port": 0,
 }  # fmt: skip
 """Flags that are no part of a run's configuration: two starts of one run may differ in them."""
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Do many trials and put them into one table; flags of train or ladder say what all trials have in common."""
+
+    grid: tuple[str, ...] = ()
+    """Fields with the values to combine, such as seed=0,1,2 set.learning_rate=0.001,0.003 layout=classic,u-trap."""
+    random: tuple[str, ...] = ()
+    """Fields to draw: set.gamma=uniform:0.9:1, set.learning_rate=log:1e-4:1e-2, set.n_steps=int:8:64, agent=dqn,ppo."""
+    n_trials: int = 20
+    """Draws of --random; each meets every combination of --grid."""
+    design_seed: int = 0
+    """Of what --random draws."""
+    trial: Literal["train", "ladder"] = "train"
+    """What a trial does."""
+    jobs: int | None = None
+    """Trials at once; as many as there are cores by default."""
+    backend: Literal["local", "ray"] = "local"
+    """Where trials are done: on this machine, or on the Ray cluster that it belongs to."""
+    checkpoint_s: float = CHECKPOINT_S
+    """Seconds between two checkpoints of a training; 0 makes one at every opportunity."""
+    run_dir: Path | None = None
+    """Where the files go; runs/<run-id> below the current folder by default."""
+    resume: bool = False
+    """Go on with the sweep in --run-dir where it was stopped or killed; its config says the rest."""
+    config: Path | None = None
+    """A sweep's config.json: makes that sweep again; flags after it change it."""
+    common: Annotated[tuple[str, ...], tyro.conf.Suppress] = ()
+    """The flags of the command that a trial does, as words."""
+
+    def __call__(self) -> int:
+        """Run it."""
+        from gridnav.experiment.sweep import TABLE, carry_out, check_backend
+
+        jobs = self.jobs or cpu_count()
+        if not 1 <= jobs <= 1024:
+            raise InputError(f"--jobs {self.jobs} is outside 1 to 1024")
+        check_backend(self.backend)
+        trials, config = self._plan()
+        with _directory(self.run_dir, self.resume, "sweep", config) as run, _trials_bar(len(trials)) as on_done:
+            outcomes = carry_out(
+                trials, run, jobs=jobs, backend=self.backend, checkpoint_s=self.checkpoint_s, on_done=on_done
+            )
+        _show_sweep(trials, outcomes)
+        stdout.print(f"table      {run.path / TABLE}")
+        return 0
+
+    def _plan(self) -> tuple[list[Trial], dict[str, Any]]:
+        """The trials, each checked as its command would, and the configuration of them all."""
+        from gridnav.experiment.design import settings_of
+        from gridnav.experiment.sweep import Trial
+
+        if not self.grid and not self.random:
+            raise InputError("a sweep needs something to vary: --grid seed=0,1,2 or --random FIELD=LAW")
+        if not 0 <= self.design_seed < 2**32:
+            raise InputError(f"--design-seed {self.design_seed} is outside 0 to 4294967295")
+        command = COMMANDS[self.trial]
+        common = _parse(command, self.trial, list(self.common))
+        alone = [key for key, default in OF_ONE_START.items() if getattr(common, key) != default]
+        if alone:
+            raise InputError(f"--{alone[0].replace('_', '-')} is for one run: leave it out of the sweep")
+        _, shared = common._problem()
+        settings = settings_of(self.grid, self.random, n_draws=self.n_trials, seed=self.design_seed)
+        trials = []
+        for number, one in enumerate(settings):
+            words = _words(_with_settings(shared, one, self.trial), "the sweep")
+            trials.append(Trial(number, one, _parse(command, self.trial, words).checked()[1]))
+        own = {key: value for key, value in asdict(self).items() if key in OF_A_SWEEP}
+        return trials, json.loads(json.dumps(shared | {"command": "sweep", **own}))
+
+
+OF_A_SWEEP = ("trial", "grid", "random", "n_trials", "design_seed")
+"""Flags of a sweep that are part of its configuration, beside those that its trials have in common."""
 
 
 @dataclass(frozen=True)
@@ -349,8 +422,9 @@ class View(_Episodes):
         pick = Pick(self.episode, self.worst, self.failed)
         if self.overlay and pick.is_given:
             raise InputError("--overlay shows all episodes: leave --episode, --worst and --failed out")
-        if len(runs) == 1 and not (pick.is_given or self.rollouts or self.overlay):
-            recording = runs[0].recording
+        recording = runs[0].recording
+        is_there = recording.is_file() or not runs[0].rollouts.is_dir()  # trials of a sweep have rollouts alone
+        if len(runs) == 1 and is_there and not (pick.is_given or self.rollouts or self.overlay):
             if not recording.is_file():
                 raise InputError(f"{str(self.run)!r} has no {recording.name}: the run has not finished")
             check_recording(recording)
@@ -569,6 +643,7 @@ class Doctor:
 COMMANDS: dict[str, Callable[..., Any]] = {
     "ladder": Ladder,
     "train": Train,
+    "sweep": Sweep,
     "evaluate": Evaluate,
     "view": View,
     "video": Video,
@@ -598,7 +673,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except NonFiniteError as error:
         code, message, cause = 4, str(error), error
     except KeyboardInterrupt as error:
-        resumes = words[:1] in (["train"], ["ladder"])
+        resumes = words[:1] in (["train"], ["ladder"], ["sweep"])
         message = "interrupted" + ("; --resume goes on from the run's last checkpoint" if resumes else "")
         code, cause = 130, error
     if debug:
@@ -616,8 +691,43 @@ def _run(words: list[str]) -> int:
         return 0
     if words[0] not in COMMANDS:
         raise InputError(f"unknown command {words[0]!r}: the commands are {', '.join(COMMANDS)}")
-    command: int = _parse(COMMANDS[words[0]], words[0], _with_config(words[0], words[1:]))()
-    return command
+    name, flags = words[0], _with_config(words[0], words[1:])
+    if COMMANDS[name] is Sweep:
+        own, common = _apart(flags)
+        code: int = replace(_parse(Sweep, name, own), common=tuple(common))()
+    else:
+        code = _parse(COMMANDS[name], name, flags)()
+    return code
+
+
+def _apart(words: list[str]) -> tuple[list[str], list[str]]:
+    """The flags of a sweep, and those of what its trials do."""
+    names = {f"--{field.name.replace('_', '-')}" for field in fields(Sweep)} | {"--help", "-h"}
+    own: list[str] = []
+    common: list[str] = []
+    into = own
+    for word in words:
+        if word.startswith("-"):
+            into = own if word.partition("=")[0].replace("_", "-").replace("--no-", "--") in names else common
+        into.append(word)
+    return own, common
+
+
+def _with_settings(shared: Mapping[str, Any], settings: Mapping[str, str], command: str) -> dict[str, Any]:
+    """What trials have in common, with one trial's settings; ``set.NAME`` is a hyper-parameter."""
+    known = {field.name for field in fields(COMMANDS[command])} - OF_ONE_START.keys()  # type: ignore[arg-type]
+    config = {key: value for key, value in shared.items() if key != "command"}
+    for field, words in settings.items():
+        group, dot, name = field.partition(".")
+        if dot and group == "set" and group in known:
+            config["set"] = [pair for pair in config["set"] if pair.partition("=")[0] != name] + [f"{name}={words}"]
+        elif field in known - {"set"}:
+            config[field] = words
+        else:
+            names = sorted(known - {"set"}) + ["set.NAME"] * ("set" in known)
+            near = get_close_matches(field, names, 1) or names
+            raise InputError(f"{command} has no field {field!r:.60}: did you mean {near[0]}?")
+    return config
 
 
 def _parse(config: Callable[..., Config], name: str, words: list[str]) -> Config:
@@ -660,12 +770,17 @@ def _flags(name: str, config: Path) -> list[str]:
     stored = read_json(config)
     if stored.pop("command", name) != name:
         raise InputError(f"{str(config)!r} was made by another command than {name}")
+    return _words(stored, str(config))
+
+
+def _words(stored: Mapping[str, Any], source: str) -> list[str]:
+    """A configuration as words; ``source`` is where it comes from, for errors."""
     flags = []
     for key, value in stored.items():
         flag = f"--{key.replace('_', '-')}"
         words = value if isinstance(value, list) else []
         if key.replace("-", "_") in OF_ONE_START or any(str(word).startswith("-") for word in words):
-            raise InputError(f"{str(config)!r} says {flag} {value!r:.60}, which is no part of a run's configuration")
+            raise InputError(f"{source!r} says {flag} {value!r:.60}, which is no part of a run's configuration")
         if not isinstance(value, list):
             flags.append(f"{flag}={value}")
         elif value:
@@ -690,10 +805,6 @@ def _check_ending(flag: str, file: Path, *endings: str) -> None:
     if file.suffix not in endings:
         raise InputError(f"{flag} {str(file)!r} must end with {' or '.join(endings)}")
     _check_folder(flag, file)
-
-
-def _home(agent: str) -> str:
-    return "DiffDrive" if agent == "ppo" else "GridWorld"
 
 
 def _again(run: RunDirectory) -> str:
@@ -787,6 +898,46 @@ def _show_together(rows: Sequence[AcrossSeeds]) -> None:
             _share(row.collision_rate, row.collision_rate_interval), f"{row.training_seconds:.1f} s",
         )  # fmt: skip
     stdout.print(table)
+
+
+@contextlib.contextmanager
+def _trials_bar(total: int) -> Iterator[Callable[[int, int], None]]:
+    """A bar of the trials that are done."""
+    columns = (TextColumn("{task.description}"), BarColumn(bar_width=30), TextColumn("{task.fields[words]}"))
+    bar = Progress(*columns, TimeElapsedColumn(), console=stderr)
+    task = bar.add_task("trials", total=total, words="")
+
+    def on_done(done: int, failed: int) -> None:
+        bar.start()  # not earlier: what is refused gets one line and no empty ones
+        bar.update(task, completed=done, words=f"{done} of {total}" + (f", {failed} failed" if failed else ""))
+
+    try:
+        yield on_done
+    finally:
+        if bar.live.is_started:
+            bar.stop()
+
+
+SHOWN_TRIALS = 60
+"""Rows of a sweep that are shown; more are a matter for the table's file."""
+
+
+def _show_sweep(trials: Sequence[Trial], outcomes: Sequence[Outcome]) -> None:
+    settings = list(trials[0].settings)
+    table = Table("trial", *settings, "agent", "success (95 % interval)", "SPL", "SCT", "collided", "steps")
+    for one, outcome in zip(trials, outcomes, strict=True):
+        for row in outcome.rows:
+            table.add_row(
+                str(one.number), *(one.settings[name] for name in settings), row["name"],
+                _share(row["success"], (row["success_low"], row["success_high"])), f"{row['spl']:.2f}",
+                f"{row['sct']:.2f}", f"{row['collided']:.1%}", f"{row['steps']:,}",
+            )  # fmt: skip
+    if table.row_count <= SHOWN_TRIALS:
+        stdout.print(table)
+    failed = [(one, outcome.error) for one, outcome in zip(trials, outcomes, strict=True) if outcome.error]
+    if failed:
+        one, error = failed[0]
+        stdout.print(f"{len(failed)} of {len(trials)} trials failed, trial {one.number} of {error}", markup=False)
 
 
 def _share(value: float, interval: tuple[float, float]) -> str:

@@ -167,6 +167,7 @@ def train_and_report(
     *,
     checkpoint_s: float,
     spectator: Spectator | None = None,
+    with_pictures: bool = True,
 ) -> list[Result]:
     """Train agents in a world, evaluate them and write everything a run holds.
 
@@ -183,12 +184,17 @@ def train_and_report(
         on_stage: Told of the trainings and evaluations.
         checkpoint_s: Seconds between two checkpoints of a training.
         spectator: Watches every training.
+        with_pictures: Draw figures, recording and report; without them the run has evaluation and rollouts alone.
     """
     with open_log(run) as log:
         workshop = Workshop(problem, budget, seed, run, log, on_stage, checkpoint_s=checkpoint_s, spectator=spectator)
         trained = [workshop.train(kind, kind, world, choice=choice) for kind in kinds]
         results = [workshop.evaluate(one.name, one, world, one.name) for one in trained]
         write_evaluation(run, results, seed)
+        if not with_pictures:
+            for result in results:
+                save_rollouts(run.rollouts, kept(problem, result))
+            return results
         write_rollouts(run, problem, results, results, {"command": command, "training seed": seed})
         shown = pictures(run, problem, results, trained, {kind: f"{kind} on {world}" for kind in kinds}, log)
     names, many = " and ".join(kinds), len(kinds) > 1

@@ -77,15 +77,18 @@ class RunDirectory:
             yield run
 
     @contextmanager
-    def own(self) -> Iterator[None]:
+    def own(self, patience_s: float = 0.0) -> Iterator[None]:
         """Keep other processes out of the run; the system ends it with this process, whatever ends that.
+
+        Args:
+            patience_s: How long to wait for another process that owns it.
 
         Raises:
             RunInUseError: When another process owns the run; the message names it.
         """
         lock = FileLock(self._lock)
         try:
-            lock.acquire(timeout=0)
+            lock.acquire(timeout=patience_s)
         except Timeout:
             try:
                 owner = self._owner.read_text(encoding="utf-8").strip()
@@ -255,9 +258,14 @@ def _free_path(name: str) -> Path:
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write a file that is either whole or not there."""
+    write_whole(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file that is either whole or as it was before."""
     aside = path.with_name(f".tmp-{path.name}")
-    with aside.open("w", encoding="utf-8") as file:
-        file.write(json.dumps(content, indent=2, allow_nan=False) + "\n")
+    with aside.open("w", encoding="utf-8", newline="") as file:
+        file.write(text)
         file.flush()
         os.fsync(file.fileno())
     aside.replace(path)

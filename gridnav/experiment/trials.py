@@ -1,0 +1,183 @@
+"""One trial of a sweep: a pure function from a configuration to rows of numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+from gridnav.experiment.checkpoint import clear_leftovers
+from gridnav.experiment.course import CHECKPOINT_S
+from gridnav.experiment.run_directory import RunDirectory, write_json
+from gridnav.experiment.training import (
+    BUDGETS,
+    OBSERVATIONS,
+    AgentKind,
+    Budget,
+    Choice,
+    Result,
+    check_choice,
+)
+from gridnav.experiment.worlds import Problem
+from gridnav.problem.types import InputError
+
+Row = dict[str, Any]
+"""An evaluated agent: names and numbers, fit for JSON."""
+DIGITS = 6
+"""Behind the point, of the numbers in rows."""
+PATIENCE_S = 30.0
+"""How long a trial waits for a process that still works on it, whose sweep was killed."""
+
+
+@dataclass(frozen=True)
+class Training:
+    """What ``gridnav train`` is asked for."""
+
+    problem: Problem
+    """What is to be solved."""
+    budget: Budget
+    """How much may be spent."""
+    seed: int
+    """Of everything that is random in training."""
+    kinds: Sequence[AgentKind]
+    """Who learns; several are compared."""
+    world: str
+    """Where: ``GridWorld``, ``Unicycle`` or ``DiffDrive``."""
+    choice: Choice
+    """Hyper-parameters and observation."""
+
+    @classmethod
+    def of(cls, config: Mapping[str, Any], problem: Problem | None = None) -> Self:
+        """From the configuration of a run.
+
+        Args:
+            config: As in the run's ``config.json``.
+            problem: What it describes, if that is made already.
+
+        Raises:
+            InputError: When something in it is unknown, not possible or does not go together.
+        """
+        problem = problem or problem_of(config)
+        choice = Choice(config["preset"], _changes(config["set"]), config["observation"])
+        agent = config["agent"]
+        all_of_them: list[AgentKind] = [kind for kind, seen in OBSERVATIONS.items() if choice.observation in seen]
+        kinds = all_of_them if agent == "all" else [agent]
+        home = "gridnav/DiffDrive-v0" if agent == "ppo" else "gridnav/GridWorld-v0"
+        world = config.get("env", home).split("/")[1].removesuffix("-v0")
+        check_choice(kinds, problem, world, choice)
+        return cls(problem, BUDGETS[config["budget"]], config["seed"], kinds, world, choice)
+
+
+def problem_of(config: Mapping[str, Any]) -> Problem:
+    """The problem that a run's configuration describes.
+
+    Raises:
+        InputError: When a part of it is unknown or wrong.
+    """
+    return Problem.load(config["layout"], config["task"], config["reward"])
+
+
+def _changes(pairs: Sequence[str]) -> dict[str, str]:
+    """Hyper-parameters by name, from pairs such as ``batch_size=64``."""
+    changes = {}
+    for pair in pairs:
+        name, equals, value = pair.partition("=")
+        if not equals or name == "seed":
+            raise InputError(f"--set {pair!r:.60} must be name=value, and the seed is --seed")
+        changes[name] = value
+    return changes
+
+
+def trial(config: Mapping[str, Any], path: Path, checkpoint_s: float = CHECKPOINT_S) -> list[Row]:
+    """Do what a configuration asks for; the same configuration gives the same rows.
+
+    A trial that was killed goes on from its checkpoints, and gives the rows that it would have given.
+
+    Args:
+        config: As in the ``config.json`` of a run, with the command under ``command``: ``train`` or ``ladder``.
+        path: The trial's run directory, which is made if it does not exist.
+        checkpoint_s: Seconds between two checkpoints of a training.
+
+    Returns:
+        One row per evaluated agent.
+
+    Raises:
+        InputError: When the configuration is not possible, or the directory belongs to another one.
+        NonFiniteError: When a training stopped at a number that is not finite.
+        OSError: When the disk is full, or another process works in the directory.
+    """
+    with _directory(path, config) as run:
+        results = TRIALS[config["command"]](config, run, checkpoint_s)
+    return [row_of(result) for result in results]
+
+
+@contextmanager
+def _directory(path: Path, config: Mapping[str, Any]) -> Iterator[RunDirectory]:
+    """The trial's run directory, this process's own."""
+    run = RunDirectory(path)
+    path.mkdir(parents=True, exist_ok=True)
+    with run.own(patience_s=PATIENCE_S):
+        check_config(run, config)
+        if not run.config.is_file():
+            write_json(run.config, config)
+        run.figures.mkdir(exist_ok=True)
+        clear_leftovers(run.checkpoints)
+        yield run
+
+
+def check_config(run: RunDirectory, config: Mapping[str, Any]) -> None:
+    """Whether a trial may go on in a directory.
+
+    Raises:
+        InputError: When a trial of another configuration began there.
+    """
+    if run.config.is_file() and run.read_config() != config:
+        raise InputError(f"{str(run.path)!r} holds a trial of another config: begin another sweep")
+
+
+def _train(config: Mapping[str, Any], run: RunDirectory, checkpoint_s: float) -> list[Result]:
+    from gridnav.experiment.results import train_and_report
+
+    job = Training.of(config)
+    return train_and_report(
+        job.problem, job.budget, job.seed, job.kinds, job.world, job.choice, run, "", config, _unseen,
+        checkpoint_s=checkpoint_s, with_pictures=False,
+    )  # fmt: skip
+
+
+def _ladder(config: Mapping[str, Any], run: RunDirectory, checkpoint_s: float) -> list[Result]:
+    from gridnav.experiment.ladder import climb
+
+    budget = BUDGETS[config["budget"]]
+    return climb(problem_of(config), budget, config["seed"], run, "", config, _unseen, checkpoint_s=checkpoint_s)
+
+
+TRIALS: dict[str, Callable[[Mapping[str, Any], RunDirectory, float], list[Result]]] = {
+    "train": _train,
+    "ladder": _ladder,
+}
+"""What a trial can do, by the name of the command that does it alone."""
+
+
+def _unseen(name: str) -> Callable[[Any], None]:
+    """Nobody watches a trial."""
+    return lambda progress: None
+
+
+def row_of(result: Result) -> Row:
+    """The numbers of a result that a table of many shows; none of them is a wall-clock time."""
+    summary = result.summary
+    low, high = summary.success_interval
+    numbers = {
+        "success": summary.success_rate,
+        "success_low": low,
+        "success_high": high,
+        "spl": summary.spl,
+        "sct": summary.sct,
+        "collided": summary.collision_rate,
+        "median_time_s": summary.median_time_s,
+    }
+    rounded = {name: None if value is None else round(value, DIGITS) for name, value in numbers.items()}
+    return {"name": result.name, "world": result.world, "episodes": summary.episodes, **rounded, "steps": result.steps}
