@@ -870,7 +870,13 @@ def _show(results: Sequence[Result], run: RunDirectory | None, *, title: str = "
     if run is not None:
         if run.report.is_file():  # a drive has none
             stdout.print(f"report     {run.report}")
-        stdout.print(f"recording  {run.recording}   (gridnav view {shlex.quote(str(run.path))})")
+        stdout.print(f"recording  {run.recording}   ({_program()} view {shlex.quote(str(run.path))})")
+
+
+def _program() -> str:
+    """What one types for ``gridnav`` in this shell; through start.py its folder is not on the path."""
+    beside = Path(sys.executable).with_name("gridnav.exe" if os.name == "nt" else "gridnav")
+    return shlex.quote(os.path.relpath(beside)) if not shutil.which("gridnav") and beside.exists() else "gridnav"
 
 
 def _notes(result: Result) -> Iterator[str]:

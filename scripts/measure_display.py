@@ -1,10 +1,16 @@
 """Measures what looking costs; run it with nothing else running.
 
 python scripts/measure_display.py
+python scripts/measure_display.py live [STEPS]
 
-Times and size of a recording of 500 steps with 24 rays, a screenshot, films of 30 s, and how long a page takes to come.
+The first: times and size of a recording of 500 steps with 24 rays, a screenshot, films of 30 s, and how long a page
+takes to come. The second: what ``--live`` costs a training of PPO on DiffDrive, with and without it in turn.
 """
 
+import json
+import os
+import resource
+import signal
 import statistics
 import subprocess
 import sys
@@ -18,6 +24,7 @@ import numpy as np
 
 from gridnav.agents import Planner
 from gridnav.display.recording import screenshot, write_recording
+from gridnav.display.viewer import free_port, is_open, wait_until
 from gridnav.experiment.evaluation import evaluate, policy_for
 from gridnav.experiment.live import SHARE
 from gridnav.experiment.policy_maps import policy_maps
@@ -59,7 +66,48 @@ def main() -> None:
             [*gridnav, "view", str(run), "--screenshot", str(place / "run.png")], **quiet
         ), rounds=3)  # fmt: skip
         report("gridnav view --web to a served page", lambda: to_page([*gridnav, "view", str(run), "--web"]), rounds=3)
-    print(f"watching a training takes at most {SHARE:.0%} of its time: the next episode waits until that holds")
+    print(f"watching a training: see `live`; between two episodes at least {1 / SHARE:.0f} times what one took")
+
+
+def live(steps: int) -> None:
+    """What a training takes while it is watched over what it takes alone, by the clock and by the processor.
+
+    The processor's share counts the whole command and can be trusted on a busy machine. The episodes go to a server
+    that draws nothing: what a viewer costs depends on the graphics card.
+    """
+    port, clock, processor = free_port(), [], []
+    rerun = Path(sys.executable).with_name("rerun")
+    server = subprocess.Popen(
+        [rerun, "--serve-grpc", "--bind", "127.0.0.1", "--port", str(port)],
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+    )  # fmt: skip
+    try:
+        wait_until(lambda: is_open(port), "start")
+        for seed in range(ROUNDS):
+            took = {}
+            for watch in ((), ("--live-port", str(port)))[:: 1 if seed % 2 else -1]:
+                took[bool(watch)] = trained(steps, seed, watch)
+            clock.append(took[True][0] / took[False][0])
+            processor.append(took[True][1] / took[False][1])
+            print(f"  seed {seed}: {clock[-1]:.3f} by the clock, {processor[-1]:.3f} by the processor", flush=True)
+    finally:
+        os.killpg(server.pid, signal.SIGKILL)
+    for name, ratios in (("clock", clock), ("processor", processor)):
+        middle, low, high = statistics.median(ratios), min(ratios), max(ratios)
+        print(f"--live, {steps} steps of PPO on DiffDrive, by the {name}: {middle:.3f} ({low:.3f} to {high:.3f})")
+
+
+def trained(steps: int, seed: int, watch: tuple[str, ...]) -> tuple[float, float]:
+    """Seconds of a training by the clock, and of its whole command by the processor."""
+    quick = ("--budget", "quick", "--set", f"steps={5 * steps}")  # a fifth of the preset's
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    with tempfile.TemporaryDirectory() as folder:
+        run = Path(folder) / "run"
+        train = [sys.executable, "-m", "gridnav.cli", "train", "--agent", "ppo", "--seed", str(seed), *quick]
+        subprocess.run([*train, *watch, "--run-dir", str(run)], check=True, capture_output=True)
+        (row,) = json.loads((run / "evaluation.json").read_text())["results"].values()
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return row["training_seconds"], after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def drive(steps: int) -> Episode:
@@ -97,4 +145,7 @@ def report(what: str, measured: Callable[[], object], rounds: int = ROUNDS) -> N
 
 
 if __name__ == "__main__":
-    main()
+    if sys.argv[1:2] == ["live"]:
+        live(int(sys.argv[2]) if sys.argv[2:] else 96_000)
+    else:
+        main()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -12,6 +13,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 import rerun as rr
+import rerun.blueprint as rrb
 from matplotlib.colors import to_rgb
 from rerun.chunk import RrdReader
 
@@ -24,6 +26,7 @@ from gridnav.display.viewer import ViewerError, open_window
 from gridnav.problem.layout import Layout
 from gridnav.problem.metrics import Episode, Trace, summarise
 from gridnav.problem.robot import BURGER
+from gridnav.problem.types import AnyArray
 
 CORRIDOR = Layout.from_text("S...G\n.###.\n.....\n")
 
@@ -159,8 +162,8 @@ def test_the_run_card_says_what_was_reached_and_with_which_seeds(tmp_path: Path)
 
     ((card,),) = columns(path, "/run_card", "TextDocument:text")
     assert "# Two agents" in card
-    assert "| from / scratch | **missed** | 1.00 | 2.00 |" in card
-    assert "| warm | reached | 2.00 | 2.00 | 2.0 | 0 | 7.50 |" in card
+    assert "**from | scratch** **missed** its goal: 2.0 s, 1.00 m (shortest 2.00 m)" in card
+    assert "**warm** reached its goal: 2.0 s, 2.00 m (shortest 2.00 m), 0 collisions, return 7.50" in card
     assert "- seed: 7" in card
     assert columns(path, "/__properties/run", "seed") == [["7"]]
 
@@ -214,9 +217,9 @@ def test_the_timeline_says_what_the_robot_does_and_how_it_ended(tmp_path: Path) 
 
     write_recording(path, CORRIDOR, {"a": drive(steps=10, hits=(3, 4)), "b": drive(is_success=False)})
 
-    assert columns(path, "/state/a", "StateChange:state") == [["driving"], ["collided"], ["driving"], ["arrived"]]
-    assert columns(path, "/state/a", "step") == [0, 3, 5, 10]
-    assert columns(path, "/state/b", "StateChange:state") == [["driving"], ["did not arrive"]]
+    assert columns(path, "/state/1_a", "StateChange:state") == [["driving"], ["collided"], ["driving"], ["arrived"]]
+    assert columns(path, "/state/1_a", "step") == [0, 3, 5, 10]
+    assert columns(path, "/state/2_b", "StateChange:state") == [["driving"], ["did not arrive"]]
 
 
 def test_many_episodes_lie_one_above_the_other(tmp_path: Path) -> None:
@@ -238,7 +241,7 @@ def test_a_name_with_slashes_and_spaces_stays_one_entity(tmp_path: Path) -> None
 
     write_recording(path, CORRIDOR, {"PPO / warm: 2": drive()})
 
-    assert r"/distance_to_goal/PPO\ \/\ warm\:\ 2" in entities(path)
+    assert {r"/distance_to_goal/PPO\ \/\ warm\:\ 2", "/state/1_PPO_warm_2"} <= entities(path)
 
 
 def test_rollouts_without_a_trace_or_with_other_goals_are_refused(tmp_path: Path) -> None:
@@ -248,23 +251,59 @@ def test_rollouts_without_a_trace_or_with_other_goals_are_refused(tmp_path: Path
         write_recording(tmp_path / "run.rrd", CORRIDOR, {"a": drive(), "b": replace(drive(), goal=(2, 4))})
 
 
-def test_a_picture_is_made_without_a_display(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("DISPLAY", raising=False)
-    recording, picture = tmp_path / "run.rrd", tmp_path / "run.png"
-    write_recording(recording, CORRIDOR, {"robot": drive()})
-
+@contextmanager
+def needs_vulkan() -> Iterator[None]:
     try:
-        screenshot(recording, picture, time_s=1.0, window_size=(800, 600))
+        yield
     except ViewerError as error:
         if "Vulkan" in str(error):
             pytest.skip("no Vulkan driver here (Debian package mesa-vulkan-drivers)")
         raise
 
+
+def centre_column(pixels: AnyArray, colour: str) -> float:
+    """Where the pixels of a colour are in the upper left of a picture, where the maze is."""
+    view = pixels[: len(pixels) // 2, : pixels.shape[1] * 2 // 3]
+    columns_there = np.nonzero(np.abs(view - to_rgb(colour)).max(axis=-1) < 0.05)[1]
+    assert columns_there.size > 20, f"nothing of colour {colour} is in sight"
+    return float(np.median(columns_there))
+
+
+@pytest.mark.parametrize("time_s", [0.6, 1.4])
+def test_the_picture_shows_the_robot_where_its_data_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, time_s: float
+) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    recording, picture = tmp_path / "run.rrd", tmp_path / "run.png"
+    episode = drive()
+    assert episode.trace is not None
+    blind = replace(episode.trace, scans_m=np.full_like(episode.trace.scans_m, np.nan))  # rays would cover the start
+    write_recording(recording, CORRIDOR, {"robot": replace(episode, trace=blind)})
+
+    with needs_vulkan():
+        screenshot(recording, picture, time_s=time_s, window_size=(800, 600))
+
     pixels = matplotlib.image.imread(picture)[..., :3]
     assert pixels.shape == (600, 800, 3)
-    for colour in (palette.GOAL, palette.FAST, palette.SLOW):
-        near = np.abs(pixels - to_rgb(colour)).max(axis=-1) < 0.1
-        assert near.sum() > 20, f"nothing of colour {colour} is in sight"
+    # By hand: from the start at x = 0.25 m to the goal at 2.25 m at 1 m/s, so after t seconds t/2 of the way. The
+    # robot's top is 0.2 m nearer to the eye, 3 m above the middle, than the floor: 0.2 off the middle looks like 0.214.
+    start, goal = centre_column(pixels, palette.START), centre_column(pixels, palette.GOAL)
+    robot = centre_column(pixels, palette.INK)
+    assert (robot - start) / (goal - start) == pytest.approx(time_s / 2, abs=0.025)
+
+
+def test_what_a_view_cannot_show_is_an_error_and_no_picture(tmp_path: Path) -> None:
+    torn = rr.Image.from_fields(buffer=bytes(5), format=rr.components.ImageFormat(100, 100, color_model="L"))
+    recording = rr.RecordingStream("gridnav", send_properties=False)
+    recording.save(tmp_path / "torn.rrd", default_blueprint=rrb.Blueprint(rrb.Spatial2DView(), auto_views=False))
+    recording.set_time("sim_time", duration=0.0)
+    recording.log("image", torn)
+    recording.disconnect()
+
+    with needs_vulkan(), pytest.raises(ViewerError, match="Expected 10000 bytes"):
+        screenshot(tmp_path / "torn.rrd", tmp_path / "torn.png")
+
+    assert not (tmp_path / "torn.png").exists()
 
 
 def test_without_a_graphics_driver_the_error_says_what_to_install(

@@ -11,7 +11,8 @@ the processes. A recording holds rollouts on common timelines, ``sim_time`` in s
     /rollouts/NAME/robot, robot/body, heading, wheels     where the robot is
     /rollouts/NAME/robot/lidar/rays, hits                 what it sees, in the lidar's frame
     /return/NAME, /action/NAME, /wheel_speed/NAME,        curves
-    /distance_to_goal/NAME, /state/NAME
+    /distance_to_goal/NAME
+    /state/1_NAME                                         what it does, in words; the second rollout's is 2_NAME
     /run_card                                             what this is, in Markdown
 
 An overlay of many episodes has ``/maze``, ``/trails``, ``/robots``, ``/ends`` and ``/arrived`` instead.
@@ -20,6 +21,7 @@ Data goes in as columns, one call per entity: one call per step is forty times s
 
 from __future__ import annotations
 
+import re
 import time
 import warnings
 from collections.abc import Mapping, Sequence
@@ -173,7 +175,8 @@ def _log_rollouts(
         colour = palette.SERIES[number % len(palette.SERIES)]
         _log_curves(recording, _path("distance_to_goal", name), _times(trace), {name: to_goal}, [colour])
         _log_reward_and_action(recording, name, trace, robot)
-        _log_states(recording, _path("state", name), episode, trace, robot)
+        # The viewer writes this path above the row, in this order: without the signs that it would escape.
+        _log_states(recording, f"/state/{number + 1}_{re.sub(r'[^A-Za-z0-9.-]+', '_', name)}", episode, trace, robot)
 
 
 def write_overlay(
@@ -278,7 +281,7 @@ def _log_policy(recording: rr.RecordingStream, at: str, layout: Layout, shown: P
     vectors = directions * layout.cell_size_m * (0.25 + 0.4 * np.clip(shown.speeds[inside], 0, 1))[:, None]
     origins = layout.to_metres(cells) - vectors / 2
     flat = [np.column_stack([part, np.full(len(part), height)]) for part, height in ((origins, 0.008), (vectors, 0.0))]
-    arrows = rr.Arrows3D(origins=flat[0], vectors=flat[1], radii=0.02, colors=_rgba("#FFFFFF", 200))
+    arrows = rr.Arrows3D(origins=flat[0], vectors=flat[1], radii=0.035, colors=_rgba("#FFFFFF", 200))
     recording.log(f"{at}/arrows", arrows, static=True)
 
 
@@ -311,8 +314,9 @@ def _log_ways(
         points = layout.to_metres(np.array(cells))
     else:
         points = distance.path(start, goal)
-    plan = np.column_stack([points, np.full(len(points), 0.02)])
-    recording.log(f"{at}/plan", rr.LineStrips3D([plan], colors=_rgba(palette.PURPLE), radii=-1.5), static=True)
+    # Under the trail and broader than it: both are seen where they are one.
+    plan = np.column_stack([points, np.full(len(points), 0.01)])
+    recording.log(f"{at}/plan", rr.LineStrips3D([plan], colors=_rgba(palette.PURPLE), radii=-2.5), static=True)
     dots = np.stack(
         np.meshgrid(
             (np.arange(layout.n_cols * FIELD_DOTS) + 0.5) * layout.cell_size_m / FIELD_DOTS,
@@ -418,11 +422,11 @@ def _log_lidar(recording: rr.RecordingStream, at: str, trace: Trace, robot: Robo
 
 def _log_course(recording: rr.RecordingStream, at: str, trace: Trace, robot: Robot) -> None:
     """The way taken, coloured by speed, and where it touched walls; both from start to end, at all times."""
-    points = np.column_stack([trace.poses[:, :2], np.full(len(trace.poses), 0.012)])
+    points = np.column_stack([trace.poses[:, :2], np.full(len(trace.poses), 0.02)])
     speeds = np.linalg.norm(np.diff(trace.poses[:, :2], axis=0), axis=1) / np.diff(trace.time_s)
     share = np.clip(speeds / robot.max_speed_m_s, 0.0, 1.0)[:, None]
     colours = np.round((1 - share) * _rgba(palette.SLOW) + share * _rgba(palette.FAST)).astype(np.uint8)
-    trail = rr.LineStrips3D(np.stack([points[:-1], points[1:]], axis=1), colors=colours, radii=-2.0)
+    trail = rr.LineStrips3D(np.stack([points[:-1], points[1:]], axis=1), colors=colours, radii=-1.5)
     recording.log(f"{at}/trail", trail, static=True)
     touched = points[1:][trace.hits > 0] + [0, 0, 0.01]
     marks = rr.Points3D(touched, colors=_rgba(palette.COLLISION), radii=-5.0)
@@ -518,14 +522,12 @@ def _run_card(title: str, rollouts: Mapping[str, Episode], properties: Mapping[s
         f"# {_plain(title)}",
         f"From cell {first.start} to cell {first.goal} (row, column), the same in each view.",
         "",
-        "| rollout | goal | path m | shortest m | time s | hits | return |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
     ]
-    for name, episode in rollouts.items():
+    for name, episode in rollouts.items():  # a list, for a table is cut off where the view is narrow
         lines.append(
-            f"| {_plain(name)} | {'reached' if episode.is_success else '**missed**'} "
-            f"| {episode.path_length_m:.2f} | {episode.shortest_path_m:.2f} | {episode.elapsed_s:.1f} "
-            f"| {episode.collisions} | {episode.episode_return:.2f} |"
+            f"- **{_plain(name)}** {'reached' if episode.is_success else '**missed**'} its goal: "
+            f"{episode.elapsed_s:.1f} s, {episode.path_length_m:.2f} m (shortest {episode.shortest_path_m:.2f} m), "
+            f"{_counted(episode.collisions, 'collision')}, return {episode.episode_return:.2f}"
         )
     lines += ["", "Trail: orange is slow, blue is full speed. Red: collisions. Purple: the shortest way.", ""]
     return "\n".join(lines + _facts(properties))
@@ -548,9 +550,13 @@ def _facts(properties: Mapping[str, object] | None) -> list[str]:
     return [f"- {_plain(key)}: {_plain(str(value))}" for key, value in (properties or {}).items()]
 
 
+def _counted(n: int, what: str) -> str:
+    return f"{n} {what}" if n == 1 else f"{n} {what}s"
+
+
 def _plain(text: str) -> str:
-    """Text on one line that cannot break a Markdown table."""
-    return " ".join(text.replace("|", "/").split())
+    """Text on one line."""
+    return " ".join(text.split())
 
 
 # ---- The arrangement ---------------------------------------------------------------------------
@@ -592,7 +598,7 @@ def _side_by_side(layout: Layout, traces: Mapping[str, Trace]) -> rrb.Blueprint:
     shared = [
         rrb.TextDocumentView(name="Run", origin="/run_card"),
         _curve_view("Shortest way to the goal (m)", "/distance_to_goal", to_goal),
-        rrb.StateTimelineView(name="What it does", origin="/state"),
+        rrb.StateTimelineView(name="What it does", origin="/state", time_view=_whole_episode()),
     ]
     return _arranged(
         rrb.Vertical(*rows, row_shares=[10, 6, 4]), rrb.Vertical(*shared, row_shares=[5, 5, 3]), max(len(traces), 2)
@@ -606,7 +612,7 @@ def _overlaid(layout: Layout) -> rrb.Blueprint:
     )
     shared = [
         rrb.TextDocumentView(name="Run", origin="/run_card"),
-        _curve_view("Share that has arrived", "/arrived", rrb.PlotLegend(visible=False)),
+        _curve_view("Share that has arrived", "/arrived", rrb.PlotLegend(visible=False), (0.0, 1.0)),
     ]
     return _arranged(maze, rrb.Vertical(*shared, row_shares=[1, 1]), 2)
 
@@ -621,8 +627,17 @@ def _arranged(main: rrb.Container | rrb.View, side: rrb.Container, main_share: i
     )
 
 
-def _curve_view(name: str, origin: str, legend: rrb.PlotLegend) -> rrb.TimeSeriesView:
-    return rrb.TimeSeriesView(name=name, origin=origin, plot_legend=legend)
+def _curve_view(
+    name: str, origin: str, legend: rrb.PlotLegend, values: tuple[float, float] | None = None
+) -> rrb.TimeSeriesView:
+    axis_y = rrb.archetypes.ScalarAxis(range=values) if values else None
+    return rrb.TimeSeriesView(name=name, origin=origin, plot_legend=legend, axis_x=_whole_episode(), axis_y=axis_y)
+
+
+def _whole_episode() -> rrb.archetypes.TimeAxis:
+    # By itself the viewer shows no more than a minute, around the present moment.
+    everything = rr.TimeRangeBoundary.infinite()
+    return rrb.archetypes.TimeAxis(view_range=rr.TimeRange(start=everything, end=everything))
 
 
 def _action_words(name: str, trace: Trace) -> str:
@@ -634,7 +649,7 @@ def _eye(layout: Layout, n_views: int) -> rrb.EyeControls3D:
     width, height = layout.size_m
     centre = np.array([width / 2, height / 2, 0.0])
     tilt = np.deg2rad(20.0)
-    away = max(1.4, 0.47 * n_views) * max(width, height) * np.array([0.0, -np.sin(tilt), np.cos(tilt)])
+    away = max(1.2, 0.47 * n_views) * max(width, height) * np.array([0.0, -np.sin(tilt), np.cos(tilt)])
     return rrb.EyeControls3D(kind="Orbital", position=centre + away, look_target=centre, eye_up=[0, 0, 1])
 
 
@@ -711,6 +726,7 @@ def screenshot(
         errors = [
             f"{v.name}: {r.summary}" for v in client.get_state().views for r in v.reports if r.severity == "error"
         ]
+        errors += [entry.message for entry in client.get_logs() if entry.level == "ERROR"]
         if errors:
             raise ViewerError(f"the viewer cannot show {path.name}: {'; '.join(errors)}")
     Path(png_path).write_bytes(picture)

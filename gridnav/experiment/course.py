@@ -87,6 +87,8 @@ class Course:
             KeyboardInterrupt: After a checkpoint, when the process was asked to stop.
             NonFiniteError: When a NaN or infinity came up; the last checkpoint is from before.
         """
+        if self._watch is not None:  # what it can do before it learns is no part of its time
+            self._watch(self.agent, self._steps)
         self._began = time.perf_counter()
         resume = None if self._saved is None else self._saved.training
         with self._interruption:

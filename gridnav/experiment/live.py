@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable
 
 from gridnav.agents import Agent
-from gridnav.display.recording import send_recording
 from gridnav.experiment.evaluation import evaluate, policy_for
 from gridnav.experiment.policy_maps import policy_maps
 from gridnav.experiment.worlds import Problem
@@ -32,6 +31,9 @@ class Spectator:
     """
 
     def __init__(self, problem: Problem, address: str, period_s: float) -> None:
+        from gridnav.display.recording import send_recording  # takes a second to import, here before training begins
+
+        self._send_recording = send_recording
         self._problem, self._address, self._period_s = problem, address, period_s
         self._due = time.perf_counter()
         self._sent, self._is_over = 0, False
@@ -62,5 +64,5 @@ class Spectator:
         maps = policy_maps(self._problem, agent, world, [episode.goal], observation=observation)
         title = f"{name} after {steps:,} steps"
         rollout, shown = {name: episode}, {name: maps[episode.goal]}
-        send_recording(self._address, self._problem.layout, rollout, maps=shown, title=title)
+        self._send_recording(self._address, self._problem.layout, rollout, maps=shown, title=title)
         self._sent += 1

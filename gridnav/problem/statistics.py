@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import stats
 
 from gridnav.problem.types import FloatArray, InputError
 
@@ -18,6 +17,8 @@ MAX_CHUNK = 2_000_000
 
 def wilson_interval(successes: int, n: int) -> tuple[float, float]:
     """95 % interval of a share, within [0, 1] (Wilson 1927, JASA 22:209-212)."""
+    from scipy import stats  # takes half a second to import
+
     interval = stats.binomtest(successes, n).proportion_ci(COVERAGE, method="wilson")
     return float(interval.low), float(interval.high)
 
@@ -34,6 +35,8 @@ def iqm(scores: ArrayLike) -> FloatArray:
     Returns:
         Shape ``(...)``, in the unit of the scores.
     """
+    from scipy import stats
+
     return np.asarray(stats.trim_mean(np.asarray(scores, dtype=np.float64), 0.25, axis=-1))
 
 
@@ -105,6 +108,8 @@ def kaplan_meier_median(times: ArrayLike, arrived: ArrayLike) -> float | None:
     Returns:
         In the unit of the times; none where fewer than half arrive.
     """
+    from scipy import stats
+
     censored = ~np.asarray(arrived, dtype=np.bool_)
     under_way = stats.ecdf(stats.CensoredData.right_censored(np.asarray(times, dtype=np.float64), censored)).sf
     reached = under_way.quantiles[under_way.probabilities <= 0.5 + 1e-12]
