@@ -324,6 +324,10 @@ class Evaluate:
     """A picture, .png or .svg, of the runs' learning curves with intervals over seeds."""
     randomization: str | None = None
     """What varies of robots and senses, as for train; what varied in training by default."""
+    reality: tuple[Literal["parametric", "structural", "test"], ...] = ()
+    """Measure what the agents keep of their success in these worlds, which training never sees; test is sealed."""
+    report: Path | None = None
+    """An .html page for --reality: the question, the answer, a table and a figure."""
 
     def __call__(self) -> int:
         """Run it."""
@@ -341,7 +345,13 @@ class Evaluate:
                 _check_folder(flag, file)
         if self.figure is not None and self.figure.suffix not in (".png", ".svg"):
             raise InputError(f"--figure {str(self.figure)!r} must end with .png or .svg")
+        if self.report is not None:
+            _check_ending("--report", self.report, ".html")
+        if bool(self.report) > bool(self.reality) or (self.reality and (self.randomization or self.figure)):
+            raise InputError("--report goes with --reality; --randomization and --figure do not")
         runs = [RunDirectory.open(path) for path in self.runs]
+        if self.reality:
+            return self._measure_gaps(runs)
         with _progress() as on_stage:
             results = [
                 (run, evaluate_again(run, self.episodes, self.seed, on_stage, randomization=self.randomization))
@@ -360,6 +370,32 @@ class Evaluate:
             _show(one, None, title=str(run.path) if len(runs) > 1 else "")
         if together:
             _show_together(together)
+        return 0
+
+    def _measure_gaps(self, runs: Sequence[RunDirectory]) -> int:
+        """Every agent at home and in the realities."""
+        from gridnav.experiment import sim_to_real
+
+        with _progress() as on_stage:
+            gaps = sim_to_real.measure(runs, self.reality, self.episodes, on_stage)
+        if not gaps:
+            raise InputError("none of the runs has an agent that drives a robot")
+        if self.output is not None:
+            write_json(self.output, sim_to_real.as_json(gaps))
+        if self.report is not None:
+            command = f"gridnav evaluate {shlex.join(map(str, self.runs))} --reality {' '.join(self.reality)}"
+            sim_to_real.write_gap_report(self.report, gaps, f"{command} --episodes {self.episodes}")
+        shown = sim_to_real.table(gaps)
+        table = Table(*shown.columns)
+        for row in shown.rows:
+            table.add_row(*row)
+        stdout.print(table)
+        stdout.print(sim_to_real.conclusion(gaps))
+        for run in runs:
+            if "test" in self.reality:
+                stdout.print(
+                    f"{run.path}: {sim_to_real.sealed_evaluations(run)} evaluations in the test reality so far"
+                )
         return 0
 
 

@@ -39,7 +39,7 @@ UNSAFE_IMPORTS = {"pickle", "cloudpickle", "dill", "marshal", "shelve"}
 UNSAFE_CALLS = {"eval", "exec", "os.system", "os.popen", "joblib.load", "torch.load", "torch.save"}
 
 # The held-out worlds are for measuring alone.
-MAY_IMPORT_REALITY = {"gridnav.cli", "gridnav.experiment.evaluation", "gridnav.experiment.ladder"}
+MAY_IMPORT_REALITY = {"gridnav.experiment.sim_to_real"}
 
 
 def find_modules() -> dict[str, Path]:
@@ -187,7 +187,7 @@ def test_only_measuring_sees_the_held_out_worlds() -> None:
 
 
 def test_training_cannot_reach_the_held_out_worlds() -> None:
-    reached, ahead = set(), {"gridnav.experiment.training"} & MODULES.keys()
+    reached, ahead = set(), {"gridnav.experiment.training", "gridnav.experiment.ladder"} & MODULES.keys()
     while ahead:
         reached |= ahead
         ahead = set().union(*(OWN_IMPORTS[module] for module in ahead)) - reached

@@ -270,6 +270,38 @@ def success_bars(
     return figure
 
 
+def kept_success(
+    home: Mapping[str, tuple[float, float, float]], away: Mapping[str, Mapping[str, tuple[float, float, float]]]
+) -> Figure:
+    """What each policy keeps of its success elsewhere: a ring at home, a dot away, and the line between.
+
+    Args:
+        home: Policy to success at home, lower and upper end of its 95 % interval, each in [0, 1].
+        away: The same by the name of each other place; one panel each, side by side.
+    """
+    names = [textwrap.fill(name, NAME_LETTERS) for name in home]
+    lines = sum(name.count("\n") + 1 for name in names)
+    figure = Figure(figsize=(WIDTH_IN, 1.3 + 0.17 * (lines + len(names))), layout="constrained")
+    panels = np.atleast_1d(figure.subplots(1, len(away), sharey=True))
+    places = np.arange(len(names))
+    for axes, (place, there) in zip(panels, away.items(), strict=True):
+        _share_axis(axes, axes.xaxis, None)
+        for row, name in zip(places, home, strict=True):
+            kept, low, high = there[name]
+            axes.plot([home[name][0], kept], [row, row], color=palette.GRID_LINE, linewidth=5, zorder=1, gid="lost")
+            axes.plot([low, high], [row, row], color=palette.BLUE, linewidth=1.6, zorder=2, gid="interval")
+            ring = {"markerfacecolor": "white", "markeredgecolor": palette.INK}
+            axes.plot(home[name][0], row, "o", markersize=8, zorder=3, clip_on=False, gid="home", **ring)
+            axes.plot(kept, row, "o", color=palette.BLUE, markersize=5.5, zorder=4, clip_on=False, gid="away")
+        axes.set(title=place, xlabel="success rate", ylim=(len(names) - 0.5, -0.5))
+        axes.tick_params(axis="y", length=0)
+    panels[0].set_yticks(places, names)
+    ring_mark = Line2D([], [], marker="o", linestyle="", markerfacecolor="white", markeredgecolor=palette.INK)
+    dot = Line2D([], [], marker="o", linestyle="-", color=palette.BLUE, markersize=5.5)
+    figure.legend([ring_mark, dot], ["at home", "there, with 95 % interval"], loc="outside lower center", ncols=2)
+    return figure
+
+
 # ---- Axes -------------------------------------------------------------------------------------------
 
 

@@ -7,6 +7,7 @@ state. What a colour says is also said by a line style, a mark or a word.
 from gridnav.display.curves import (
     Curve,
     comparison,
+    kept_success,
     learning_curves,
     reward_terms,
     success_bars,
@@ -26,6 +27,7 @@ __all__ = [
     "command_motion",
     "comparison",
     "episode_strip",
+    "kept_success",
     "learning_curves",
     "reward_terms",
     "save_figure",

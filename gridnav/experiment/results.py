@@ -22,7 +22,7 @@ from gridnav.experiment.worlds import Problem
 from gridnav.problem.metrics import Episode
 from gridnav.problem.types import InputError
 
-_NEEDED = ("world", "agent", "carried", "checkpoint", "observation")
+_NEEDED = ("world", "agent", "carried", "checkpoint", "observation", "training_steps", "training_seconds")
 
 
 def write_evaluation(
@@ -236,14 +236,7 @@ def evaluate_again(
     Raises:
         InputError: When the run holds no evaluation or lacks a checkpoint.
     """
-    config, stored = run.read_config(), read_json(run.evaluation)
-    varied = config.get("randomization", "none") if randomization is None else randomization
-    try:
-        problem = Problem.load(config["layout"], config["task"], config["reward"], varied)
-        rows = {name: {key: row[key] for key in _NEEDED} for name, row in stored["results"].items()}
-        spent = {name: (row["training_steps"], row["training_seconds"]) for name, row in stored["results"].items()}
-    except (KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{str(run.path)!r} is no whole run: its {error} is missing or damaged") from None
+    problem, rows = stored_evaluation(run, randomization)
     results = []
     for name, row in rows.items():
         agent = load_agent(run.checkpoints, row["checkpoint"])
@@ -252,6 +245,25 @@ def evaluate_again(
             observation=row["observation"], seed=EVALUATION_SEED if seed is None else seed,
             on_progress=on_stage(f"evaluating {name}"),
         )  # fmt: skip
-        steps, seconds = spent[name]
-        results.append(Result(name, episodes=records, steps=steps, seconds=seconds, **row))
+        spent = row.pop("training_steps"), row.pop("training_seconds")
+        results.append(Result(name, episodes=records, steps=spent[0], seconds=spent[1], **row))
     return results
+
+
+def stored_evaluation(run: RunDirectory, randomization: str | None = None) -> tuple[Problem, dict[str, dict[str, Any]]]:
+    """What a finished run solved, and what is needed to evaluate each of its agents anew, by the name of its row.
+
+    Args:
+        run: With a config and an evaluation.
+        randomization: What varies; what varied in training by default.
+
+    Raises:
+        InputError: When the run holds no evaluation.
+    """
+    config, stored = run.read_config(), read_json(run.evaluation)
+    varied = config.get("randomization", "none") if randomization is None else randomization
+    try:
+        problem = Problem.load(config["layout"], config["task"], config["reward"], varied)
+        return problem, {name: {key: row[key] for key in _NEEDED} for name, row in stored["results"].items()}
+    except (KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{str(run.path)!r} is no whole run: its {error} is missing or damaged") from None

@@ -1,0 +1,279 @@
+"""From simulation to realities: what policies keep of their success in worlds that training never saw."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from gridnav.agents import Agent
+from gridnav.display.figures import kept_success
+from gridnav.display.report import Picture, Report, Table, write_report
+from gridnav.experiment.checkpoint import load_agent
+from gridnav.experiment.evaluation import evaluate_in
+from gridnav.experiment.reality import WORLD, Reality, find_reality
+from gridnav.experiment.results import stored_evaluation
+from gridnav.experiment.run_directory import RunDirectory
+from gridnav.experiment.training import OnStage
+from gridnav.experiment.worlds import Problem
+from gridnav.problem.metrics import Summary, summarise
+from gridnav.problem.types import FloatArray
+
+SEALED_LOG = "sealed-evaluations.jsonl"
+"""In a run: one line for every time one of its policies was measured in the test reality."""
+DRAWS = 10_000
+"""Resamplings for intervals; their seed is fixed."""
+ENOUGH_POLICIES = 8
+"""Of fewer policies a correlation says little."""
+TITLE = "From simulation to reality"
+QUESTION = "What do policies keep of their success in worlds that training never saw?"
+COLUMNS = ("policy", "world", "success", "kept", "SPL", "collided")
+LEGEND = (
+    "Home is the world of the policy's training, with what was randomised there. Kept: success in the reality over "
+    "success at home. In parentheses 95 % intervals: Wilson's, and of what was kept by parametric bootstrap. Collided: "
+    "share of the episodes with a contact. The same starts, goals and headings everywhere."
+)
+
+
+@dataclass(frozen=True)
+class Gap:
+    """One policy at home and away."""
+
+    policy: str
+    """Its name in the report."""
+    at_home: Summary
+    """In the world it was trained in, with what was randomised there."""
+    away: dict[str, Summary]
+    """In each reality."""
+
+    def retention(self, reality: str) -> tuple[float, float, float]:
+        """Share of the success at home that is left, with its 95 % interval; NaN where there was none."""
+        home, there = self.at_home, self.away[reality]
+        if home.success_rate == 0.0:
+            return float("nan"), float("nan"), float("nan")
+        rng = np.random.default_rng(0)
+        # Successes: binomial around what was seen, at home and away.
+        draws = [rng.binomial(one.episodes, one.success_rate, DRAWS) / one.episodes for one in (there, home)]
+        low, high = np.quantile(draws[0] / np.maximum(draws[1], 0.5 / home.episodes), [0.025, 0.975])
+        return there.success_rate / home.success_rate, float(low), float(high)
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """How well success at home foretells success in a reality, over policies (SRCC, Kadian et al. 2020)."""
+
+    n_policies: int
+    """How many."""
+    pearson: float
+    """Correlation of the success rates; NaN where all are equal at one of the places."""
+    pearson_interval: tuple[float, float]
+    """95 % bootstrap interval over policies."""
+    spearman: float
+    """The same of their ranks."""
+    spearman_interval: tuple[float, float]
+    """95 % bootstrap interval over policies."""
+
+
+def measure(
+    runs: Sequence[RunDirectory],
+    realities: Sequence[str],
+    episodes: int,
+    on_stage: OnStage,
+    *,
+    policies: Sequence[str] = (),
+) -> list[Gap]:
+    """Every policy of some runs that drives robots, at home and in realities.
+
+    Args:
+        runs: Finished runs.
+        realities: Names.
+        episodes: Of each policy in each world, the same ones everywhere.
+        on_stage: Told of every evaluation.
+        policies: Names of those rows of the runs' evaluations that are measured; all of the robot's by default.
+
+    Raises:
+        InputError: When a reality is unknown, or a run is not whole.
+    """
+    worlds = [find_reality(name) for name in realities]
+    gaps = []
+    for run in runs:
+        problem, rows = stored_evaluation(run)
+        for name, row in rows.items():
+            if row["world"] == "GridWorld" or (policies and name not in policies):
+                continue
+            if row["world"] != WORLD and any(one["world"] == WORLD for one in rows.values()):
+                continue  # the same agent on the robot has a row of its own
+            agent = load_agent(run.checkpoints, row["checkpoint"])
+            label = name if len(runs) == 1 else f"{run.path.name} {name}"
+            gaps.append(_gap(label, run, problem, agent, row["world"], worlds, episodes, on_stage))
+    return gaps
+
+
+def _gap(
+    label: str,
+    run: RunDirectory,
+    problem: Problem,
+    agent: Agent,
+    home: str,
+    worlds: Sequence[Reality],
+    episodes: int,
+    on_stage: OnStage,
+) -> Gap:
+    at_home = summarise(evaluate_in(problem, agent, home, episodes, on_progress=on_stage(f"{label} at home")))
+    away = {}
+    for reality in worlds:
+        report = on_stage(f"{label} in {reality.name}")
+        away[reality.name] = reality.measure(problem, agent, episodes, on_progress=report)
+        if reality.is_sealed:
+            _log(run, label, away[reality.name])
+    return Gap(label, at_home, away)
+
+
+def _log(run: RunDirectory, policy: str, summary: Summary) -> None:
+    row = {
+        "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "policy": policy,
+        "episodes": summary.episodes,
+        "success_rate": summary.success_rate,
+    }
+    with (run.path / SEALED_LOG).open("a", encoding="utf-8") as file:
+        file.write(json.dumps(row) + "\n")
+
+
+def sealed_evaluations(run: RunDirectory) -> int:
+    """How often policies of a run were measured in the test reality."""
+    log = run.path / SEALED_LOG
+    return len(log.read_text(encoding="utf-8").splitlines()) if log.is_file() else 0
+
+
+def correlation(gaps: Sequence[Gap], reality: str) -> Correlation:
+    """Between success at home and in a reality, over at least two policies."""
+    pairs = np.array([[gap.at_home.success_rate, gap.away[reality].success_rate] for gap in gaps])
+    rng = np.random.default_rng(0)
+    # Policies: uniform with replacement, so many as there are.
+    picked = pairs[rng.integers(len(pairs), size=(DRAWS, len(pairs)))]
+    ranks = stats.rankdata(picked, axis=1)
+    return Correlation(
+        len(pairs),
+        _pearson(pairs),
+        _interval(_pearsons(picked)),
+        _pearson(stats.rankdata(pairs, axis=0)),
+        _interval(_pearsons(ranks)),
+    )
+
+
+def _pearson(pairs: FloatArray) -> float:
+    return float(_pearsons(pairs[None])[0])
+
+
+def _pearsons(pairs: FloatArray) -> FloatArray:
+    """Correlation of each draw, shape ``(n_draws,)``, of pairs of shape ``(n_draws, n, 2)``; NaN without variation."""
+    centred = pairs - pairs.mean(axis=1, keepdims=True)
+    covariance, variances = (centred[..., 0] * centred[..., 1]).sum(axis=1), (centred**2).sum(axis=1)
+    product = np.sqrt(variances.prod(axis=1))
+    return np.divide(covariance, product, out=np.full(len(pairs), np.nan), where=product > 1e-12)
+
+
+def _interval(values: FloatArray) -> tuple[float, float]:
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return float("nan"), float("nan")
+    low, high = np.quantile(known, [0.025, 0.975])
+    return float(low), float(high)
+
+
+# ---- The report ----------------------------------------------------------------------------------
+
+
+def as_json(gaps: Sequence[Gap]) -> dict[str, Any]:
+    """Everything that was measured, fit for JSON."""
+    names = list(gaps[0].away) if gaps else []
+    return {
+        "policies": {
+            gap.policy: {
+                "home": asdict(gap.at_home),
+                **{name: asdict(summary) for name, summary in gap.away.items()},
+                "retention": {name: _known(gap.retention(name)) for name in names},
+            }
+            for gap in gaps
+        },
+        "correlation": {
+            name: {key: _known(value) for key, value in asdict(correlation(gaps, name)).items()}
+            for name in names
+            if len(gaps) > 1
+        },
+    }
+
+
+def _known(value: Any) -> Any:
+    """JSON has no NaN."""
+    if isinstance(value, tuple):
+        return [_known(one) for one in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def conclusion(gaps: Sequence[Gap]) -> str:
+    """What the numbers say, a sentence for each reality."""
+    sentences = []
+    for name in gaps[0].away:
+        best, worst = (pick(gaps, key=_success_in(name)) for pick in (max, min))
+        words = (
+            f"In the {name} reality {best.policy} has {best.away[name].success_rate:.1%} success "
+            f"({best.at_home.success_rate:.1%} at home), {worst.policy} {worst.away[name].success_rate:.1%} "
+            f"({worst.at_home.success_rate:.1%})"
+        )
+        if len(gaps) > 1:
+            found = correlation(gaps, name)
+            low, high = found.pearson_interval
+            words += f"; over {found.n_policies} policies success at home and there correlate by {found.pearson:.2f} "
+            words += f"({low:.2f} to {high:.2f}{'' if found.n_policies >= ENOUGH_POLICIES else '; too few to rely on'})"
+        sentences.append(words + ".")
+    return " ".join(sentences)
+
+
+def _success_in(reality: str) -> Callable[[Gap], float]:
+    return lambda gap: gap.away[reality].success_rate
+
+
+def table(gaps: Sequence[Gap]) -> Table:
+    """A row for each policy and world."""
+    rows = []
+    for gap in gaps:
+        for name, summary in {"home": gap.at_home, **gap.away}.items():
+            low, high = summary.success_interval
+            kept = ""
+            if name != "home":
+                share, least, most = gap.retention(name)
+                kept = f"{share:.2f} ({least:.2f} to {most:.2f})"
+            success = f"{summary.success_rate:.1%} ({low:.1%} to {high:.1%})"
+            ratios = [f"{summary.spl:.2f}", f"{summary.collision_rate:.1%}"]
+            rows.append([gap.policy, name, success, kept, *ratios])
+    return Table("What was kept", COLUMNS, rows, LEGEND)
+
+
+def write_gap_report(path: Path, gaps: Sequence[Gap], command: str) -> None:
+    """A page with the question, the answer, the table and a figure."""
+    realities = {name: find_reality(name).wrong for name in gaps[0].away}
+    figure = kept_success(
+        {gap.policy: _with_interval(gap.at_home) for gap in gaps},
+        {name: {gap.policy: _with_interval(gap.away[name]) for gap in gaps} for name in realities},
+    )
+    caption = "Success at home (ring) and in each reality, with 95 % intervals: the line between is what was lost. "
+    picture = Picture(figure, caption + _described(realities))
+    page = Report(TITLE, QUESTION, conclusion(gaps), (), [picture], {}, command, recording="", tables=[table(gaps)])
+    write_report(path, page)
+
+
+def _with_interval(summary: Summary) -> tuple[float, float, float]:
+    return summary.success_rate, *summary.success_interval
+
+
+def _described(realities: Mapping[str, str]) -> str:
+    words = "; ".join(f"{name}: {wrong}" for name, wrong in realities.items())
+    return f"All realities are simulations. {words}."
