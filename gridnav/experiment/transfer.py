@@ -27,10 +27,11 @@ CAPTION = (
     "environment steps there."
 )
 LEGEND = (
-    f"Steps are the target's; to {THRESHOLD:.0%} means to the first point of the curve that is there and that the next "
-    "one confirms, where a seed that never gets there counts with all its steps. Jumpstart, asymptote (mean of the last "
-    "quarter) and transfer ratio (area under the curve) are compared with scratch. Sources are what an arm builds on, "
-    "whatever their world. Interquartile means over seeds, 95 % bootstrap intervals; with one seed there are none."
+    f"Steps are the target's; to {THRESHOLD:.0%} means to the first point of the curve that is there for good: the mean "
+    "over the tenth of the training that follows is there too. A seed that never gets there counts with all its steps. "
+    "Jumpstart and transfer ratio (area under the curve) are against scratch, the asymptote is the mean of the last "
+    "quarter. Sources are what an arm builds on, whatever their world. Interquartile means over seeds with 95 % "
+    "bootstrap intervals; with one seed there are none."
 )
 COLUMNS = (
     "arm", "jumpstart", f"steps to {THRESHOLD:.0%}", "of scratch's", "with sources", "time", "with sources",
