@@ -65,7 +65,7 @@ def clone(agent: PPOAgent, demonstrations: Demonstrations) -> dict[str, float]:
             value_errors = policy.value_net(of_critic).squeeze(1) - returns[batch]
             value_loss = torch.where(torch.isfinite(returns[batch]), value_errors, 0.0).square().mean()
             optimizer.zero_grad()
-            (action_loss + value_loss).backward()  # type: ignore[no-untyped-call]  # they share no weight, and Adam knows no scale
+            (action_loss + value_loss).backward()  # they share no weight, and Adam knows no scale
             optimizer.step()
             errors.append((action_loss.item(), value_loss.item()))
     policy.set_training_mode(False)
