@@ -27,8 +27,8 @@ CAPTION = (
     "environment steps there."
 )
 LEGEND = (
-    f"Steps are the target's. To {THRESHOLD:.0%}: the first point of the curve that is there for good, the mean over the "
-    "tenth of the training that follows being there too; a seed that never gets there counts with all its steps. "
+    f"Steps are the target's. To {THRESHOLD:.0%}: the first point of the curve that is there for good, the mean over "
+    "the tenth of the training that follows being there too; a seed that never gets there counts with all its steps. "
     "Jumpstart and transfer ratio (area under the curve) are against scratch, the asymptote is the mean of the last "
     "quarter. Sources are what an arm builds on, whatever their world. Interquartile means over seeds with 95 % "
     "bootstrap intervals; with one seed there are none."
