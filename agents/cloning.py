@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from gridnav.problem.types import FloatArray
 
-from .ppo import PPOAgent, gaussian
+from .ppo import PPOAgent
 from .torch_state import guard_gradients
 
-EPOCHS = 40
+EPOCHS = 30
 """Passes over the demonstrations."""
 BATCH_SIZE = 512
 LEARNING_RATE = 2e-3
@@ -60,13 +60,12 @@ def clone(agent: PPOAgent, demonstrations: Demonstrations) -> dict[str, float]:
             group["lr"] = LEARNING_RATE * (1.0 - 0.99 * epoch / EPOCHS)
         errors = []
         for batch in np.array_split(rng.permutation(len(actions)), n_batches):
-            means = gaussian(policy, observations[batch]).mean
-            seen = torch.isfinite(returns[batch])
-            values = policy.predict_values(observations[batch][seen]).squeeze(1)
-            action_loss = (means - actions[batch]).square().mean()
-            value_loss = (values - returns[batch][seen]).square().sum() / max(1, int(seen.sum()))
+            of_policy, of_critic = policy.mlp_extractor(policy.extract_features(observations[batch]))
+            action_loss = (policy.action_net(of_policy) - actions[batch]).square().mean()
+            value_errors = policy.value_net(of_critic).squeeze(1) - returns[batch]
+            value_loss = torch.where(torch.isfinite(returns[batch]), value_errors, 0.0).square().mean()
             optimizer.zero_grad()
-            (action_loss + value_loss).backward()  # type: ignore[no-untyped-call]  # they share no weight, and Adam knows no scale
+            (action_loss + value_loss).backward()  # they share no weight, and Adam knows no scale
             optimizer.step()
             errors.append((action_loss.item(), value_loss.item()))
     policy.set_training_mode(False)

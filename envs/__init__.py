@@ -7,7 +7,7 @@ from .diff_drive import DiffDriveEnv, DiffDriveVectorEnv
 from .gl import BACK_ENDS as GL_BACK_ENDS
 from .gl import RenderingError, make_renderer
 from .gl import works as gl_works
-from .grid_moves import GridMoves, MoveDriver, lead, steer
+from .grid_moves import GridMoves, MoveDriver, glide, lead
 from .grid_world import GridWorldEnv, GridWorldVectorEnv
 from .layout_mix import LayoutMix
 from .lidar import scan
@@ -44,10 +44,10 @@ __all__ = [
     "build_model",
     "build_spec",
     "gl_works",
+    "glide",
     "lead",
     "make_renderer",
     "scan",
-    "steer",
 ]
 
 MAX_EPISODE_STEPS = {"GridWorld": 100, "Unicycle": 500, "DiffDrive": 500}

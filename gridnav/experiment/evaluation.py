@@ -11,7 +11,7 @@ from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 
 from gridnav.agents import Agent, OnProgress, Progress, TabularAgent
-from gridnav.envs import MoveDriver, NavigationVectorEnv, lead, steer
+from gridnav.envs import MoveDriver, NavigationVectorEnv, glide, lead
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.behaviour import diagnose
 from gridnav.problem.geodesic import Geodesic
@@ -105,7 +105,7 @@ def follow(moves_for: Policy, worlds: NavigationVectorEnv) -> Policy:
         moves = moves_for(number * len(goals) + goal_rank[tuple(goal_cells.T)])
         is_there = (cells == goal_cells).all(axis=1, keepdims=True)  # a table knows no move in the goal's own cell
         targets = np.where(is_there, layout.to_metres(goal_cells), lead(poses, moves, layout))
-        return steer(poses, targets, robot, period_s).astype(np.float32)
+        return glide(poses, targets, robot, period_s).astype(np.float32)
 
     return act
 

@@ -27,11 +27,11 @@ CAPTION = (
     "environment steps there."
 )
 LEGEND = (
-    f"Steps are the target's; to {THRESHOLD:.0%} means to the first point of the curve that is there and that the "
-    "next one confirms, where a seed that never gets there counts with all its steps. Jumpstart, asymptote (mean of "
-    "the last quarter) and transfer ratio (area under the curve) are compared with scratch. Sources are what an arm "
-    "builds on, whatever their world. Interquartile means over seeds, 95 % bootstrap intervals; with one seed there "
-    "are none."
+    f"Steps are the target's. To {THRESHOLD:.0%}: the first point of the curve that is there for good, the mean over "
+    "the tenth of the training that follows being there too; a seed that never gets there counts with all its steps. "
+    "Jumpstart and transfer ratio (area under the curve) are against scratch, the asymptote is the mean of the last "
+    "quarter. Sources are what an arm builds on, whatever their world. Interquartile means over seeds with 95 % "
+    "bootstrap intervals; with one seed there are none."
 )
 COLUMNS = (
     "arm", "jumpstart", f"steps to {THRESHOLD:.0%}", "of scratch's", "with sources", "time", "with sources",
@@ -74,7 +74,8 @@ class TransferReport:
             f"On {self.target}, {n_seeds}, learning from scratch needs {_steps(scratch)} to {THRESHOLD:.0%} success, "
             f"and {self.best}, the quickest arm, {_steps(arm)}{share}, with a jumpstart of "
             f"{_number(arm.jumpstart, '+.2f')}, and {_count(arm.total_steps.value)} steps if those of its sources "
-            "count; " + (f"transfer was negative for {', '.join(harm)}." if harm else "no arm was worse than scratch.")
+            "count, whatever their world; "
+            + (f"transfer was negative for {', '.join(harm)}." if harm else "no arm was worse than scratch.")
         )
 
     @property
@@ -124,7 +125,7 @@ def transfer_report(runs: Sequence[RunDirectory]) -> TransferReport:
     if SCRATCH not in learnt:
         raise InputError("a transfer report compares arms with scratch: add it to --arms")
     arms = {name: transfer(learnt[name], learnt[SCRATCH], horizon) for name in ARMS if name in learnt}
-    layout = str(configs[0]["layout"]).split("\n")[0]
+    layout = "a maze of its own" if "\n" in configs[0]["layout"] else configs[0]["layout"]
     task = "" if configs[0]["task"] == "default" else f", task {configs[0]['task']}"
     return TransferReport(f"{world}, {layout}{task}", seeds, horizon, arms, {name: learnt[name] for name in arms})
 
