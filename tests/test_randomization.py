@@ -262,3 +262,335 @@ def test_an_environment_tells_its_curriculum_which_episodes_arrived(world: str) 
     began, ended, arrived = env._draws.curriculum.state[1:]
     assert (ended, arrived) == (sampled, 0)
     assert began == ended + env._draws.curriculum.is_sample.sum()
+
+
+# ---- Scalar and vector, states -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("randomization", ["burger", MAZES], ids=["burger", "mazes"])
+def test_single_environments_are_the_batch_bit_for_bit(world: str, randomization: Any) -> None:
+    """But for the maze, which a batch shares: there the batch is of one."""
+    n, n_steps, limit = (4, 210, 60) if randomization == "burger" else (1, 130, 60)
+    batch = make(world, randomization, n, layout="classic", max_episode_steps=limit)
+    observations, info = batch.reset(seed=list(range(n)))
+    singles = [
+        gym.make(f"gridnav/{world}-v0", randomization=randomization, max_episode_steps=limit, disable_env_checker=True)
+        for _ in range(n)
+    ]
+    for i, single in enumerate(singles):
+        observation, own_info = single.reset(seed=i)
+        np.testing.assert_array_equal(observation, observations[i])
+        assert all(type(value) is float for value in own_info["randomization"].values())
+        assert own_info["randomization"] == {name: drawn[i] for name, drawn in info["randomization"].items()}
+
+    for actions in bold_actions(n_steps, n):
+        observations, rewards, terminated, truncated, info = batch.step(actions)
+        reached = info.get("final_info", info)
+        for i, single in enumerate(singles):
+            observation, reward, own_terminated, own_truncated, own_info = single.step(actions[i])
+            assert (reward, own_terminated, own_truncated) == (rewards[i], terminated[i], truncated[i])
+            np.testing.assert_array_equal(own_info["pose"], reached["pose"][i])
+            assert own_info["randomization"] == {name: drawn[i] for name, drawn in reached["randomization"].items()}
+            if own_terminated or own_truncated:
+                np.testing.assert_array_equal(observation, info["final_obs"][i])
+                if randomization != "burger":
+                    continue  # the next reset gives it another maze, and the batch keeps its own
+                observation, _ = single.reset()
+            np.testing.assert_array_equal(observation, observations[i])
+        if randomization != "burger" and (terminated | truncated).any():
+            return
+
+
+@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("randomization", ["burger", "curriculum", MAZES], ids=["burger", "curriculum", "mazes"])
+def test_an_environment_goes_on_from_the_middle_of_an_episode_bit_for_bit(world: str, randomization: Any) -> None:
+    options = {"num_envs": 5, "layout": "classic", "max_episode_steps": 30}
+    first, other = make(world, randomization, **options), make(world, randomization, **options)
+    first.reset(seed=3)
+    for actions in bold_actions(47, 5, seed=1):
+        first.step(actions)
+
+    other.set_state(through_files(first.get_state()))
+
+    assert other.layout == first.layout
+    for actions in bold_actions(50, 5, seed=2):
+        for a, b in zip(first.step(actions), other.step(actions), strict=True):
+            assert_equal(a, b)
+    assert_equal(first.reset(), other.reset())
+    assert other.layout == first.layout
+
+
+@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("randomization", ["curriculum", MAZES], ids=["curriculum", "mazes"])
+def test_a_mix_of_layouts_goes_on_from_the_middle_bit_for_bit(world: str, randomization: Any) -> None:
+    def mix() -> LayoutMix:
+        def worlds(layout: Layout, n: int) -> NavigationVectorEnv:
+            env = make(world, randomization, n, layout=layout, max_episode_steps=7)
+            assert isinstance(env, NavigationVectorEnv)
+            return env
+
+        return LayoutMix(worlds, 6, lambda rng: Layout.load("classic"), n_groups=3, renew_steps=12)
+
+    first, other = mix(), mix()
+    first.reset(seed=3)
+    for actions in bold_actions(17, 6, seed=1):
+        first.step(actions)
+
+    other.set_state(through_files(first.get_state()))
+
+    for actions in bold_actions(30, 6, seed=2):
+        for a, b in zip(first.step(actions), other.step(actions), strict=True):
+            assert_equal(a, b)
+
+
+def test_a_state_with_numbers_that_nothing_draws_is_refused() -> None:
+    env = make("Unicycle", "burger", 2)
+    env.reset(seed=0)
+    arrays, values = env.get_state()
+
+    for wrong in (np.nan, np.inf, 1e9):
+        drawn = arrays["imperfections.drawn"].copy()
+        drawn[1, NAMES.index("lidar_delay_s")] = wrong
+        with pytest.raises(InputError, match="outside what a randomization may draw"):
+            env.set_state(State(arrays | {"imperfections.drawn": drawn}, values))
+    with pytest.raises(InputError, match="cells of 99.0 m in the state are none of 0.5 m"):
+        env.set_state(State(arrays, {**values, "cell_size_m": 99.0}))
+    with pytest.raises(InputError, match="does not fit the randomization"):
+        make("Unicycle", "burger", 2, control_period_s=0.1).set_state(State(arrays, values))
+
+
+# ---- What every world keeps to -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("randomization", ["wide", Randomization.load("burger").scaled(3.0)], ids=["wide", "thrice"])
+def test_observations_stay_within_their_space_and_the_physics_holds(world: str, randomization: Any) -> None:
+    env = make(world, randomization, 16, layout="classic", max_episode_steps=60)
+    observations, info = env.reset(seed=0)
+    collisions = 0
+    for actions in bold_actions(150, 16):
+        observations, _, _, _, info = env.step(actions)
+        assert env.observation_space.contains(observations)
+        reached = info.get("final_info", info)
+        assert "physics_error" not in reached
+        collisions += reached["collision"].sum()
+    assert collisions > 5
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_without_a_randomization_nothing_is_said_of_one(world: str) -> None:
+    env = make(world, "none")
+    _, info = env.reset(seed=0)
+
+    assert "randomization" not in info
+
+
+# ---- Physics -------------------------------------------------------------------------------------
+
+
+def mean_speeds(world: str, action: tuple[float, float], **values: float) -> tuple[float, float]:
+    """Forward speed in m/s and turning speed in rad/s, means over 6 s after 2 s of starting."""
+    env = make(world, Randomization.fixed(**values))
+    env.reset(seed=0, options={"start": (5, 2), "goal": (0, 0), "heading_rad": 0.0})
+    way_m, headings = 0.0, []
+    for step in range(40):
+        *_, info = env.step(np.array([action]))
+        headings.append(info["pose"][0, 2])
+        if step == 9:
+            way_m = -info["path_length_m"][0]
+    way_m += info["path_length_m"][0]
+    turned = np.unwrap(headings)
+    return way_m / 6.0, float(turned[-1] - turned[9]) / 6.0
+
+
+@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize(
+    ("name", "value", "forward", "turning"),
+    [
+        ("wheel_radius", 1.02, 1.02, 1.02),  # v = omega r
+        ("wheel_radius", 0.9, 0.9, 0.9),
+        ("wheel_separation", 1.1, 1.0, 1 / 1.1),  # turn = (v_right - v_left) / b
+        ("wheel_separation", 0.9, 1.0, 1 / 0.9),
+        # No-load speed follows the voltage, U / K; friction takes its torque from both: 0.162 m/s at 9 V and 0.197 m/s
+        # at 11.1 V without friction.
+        ("battery_v", 9.0, 9.0 / 11.1, 9.0 / 11.1),
+    ],
+)
+def test_both_worlds_drive_and_turn_by_the_wheels_that_were_drawn(
+    world: str, name: str, value: float, forward: float, turning: float
+) -> None:
+    nominal_forward, _ = mean_speeds(world, (1.0, 0.0))
+    _, nominal_turn = mean_speeds(world, (0.0, 1.0))
+
+    assert mean_speeds(world, (1.0, 0.0), **{name: value})[0] / nominal_forward == pytest.approx(forward, rel=0.012)
+    assert mean_speeds(world, (0.0, 1.0), **{name: value})[1] / nominal_turn == pytest.approx(turning, rel=0.012)
+
+
+def loaded_speed_m_s(volts: float = 11.1, torque: float = 1.0, damping: float = 0.02, stiction: float = 0.01) -> float:
+    """Speed of a wheel's rim where motor and friction balance: K U / R - stiction = (K^2 / R + damping) omega."""
+    k = 11.1 / 5.969  # V s / rad, and stall torque 1.4 N m = K U / R at 11.1 V
+    resistance = k * 11.1 / (1.4 * torque)
+    return 0.033 * (k * volts / resistance - stiction) / (k * k / resistance + damping)
+
+
+@pytest.mark.parametrize(
+    ("values", "left_m_s", "right_m_s"),
+    [
+        ({}, loaded_speed_m_s(), loaded_speed_m_s()),
+        ({"battery_v": 9.0}, loaded_speed_m_s(9.0), loaded_speed_m_s(9.0)),
+        ({"wheel_damping": 0.05}, loaded_speed_m_s(damping=0.05), loaded_speed_m_s(damping=0.05)),
+        ({"wheel_stiction_n_m": 0.1}, loaded_speed_m_s(stiction=0.1), loaded_speed_m_s(stiction=0.1)),
+        ({"motor_left": 0.7}, loaded_speed_m_s(torque=0.7), loaded_speed_m_s()),
+        ({"motor_right": 0.7}, loaded_speed_m_s(), loaded_speed_m_s(torque=0.7)),
+        # In 5 s, the middle of what is looked at, a battery that loses 3 V in 100 s has lost 0.15 V.
+        ({"battery_sag_v": 3.0}, loaded_speed_m_s(10.95), loaded_speed_m_s(10.95)),
+    ],
+)
+def test_top_speed_is_where_motor_and_friction_balance(
+    values: dict[str, float], left_m_s: float, right_m_s: float
+) -> None:
+    forward, turn = mean_speeds("DiffDrive", (1.0, 0.0), **values)
+
+    assert forward == pytest.approx((left_m_s + right_m_s) / 2, rel=0.02)
+    assert turn == pytest.approx((right_m_s - left_m_s) / 0.16, abs=0.006)
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_a_larger_right_wheel_turns_the_robot_left(world: str) -> None:
+    forward, turn = mean_speeds(world, (1.0, 0.0), wheel_radius_ratio=1.02)
+
+    # Radii 2/2.02 and 2.04/2.02 of the nominal one differ by 0.0198; what is 0.16 m apart turns by it. In MuJoCo the
+    # caster, which is dragged sideways, holds against it.
+    assert 0.7 * forward * 0.0198 / 0.16 < turn < 1.02 * forward * 0.0198 / 0.16
+
+
+def wheel_speeds(n_periods: int, fraction: float, **values: float) -> FloatArray:
+    """Speed of the left wheel after every 10 ms of a command, rad/s, with 1 ms of physics."""
+    env = make("DiffDrive", Randomization.fixed(**values), control_period_s=0.01, timestep_s=0.001)
+    env.reset(seed=0, options={"start": (5, 2), "goal": (0, 0), "heading_rad": 0.0})
+    speeds = []
+    for _ in range(n_periods):
+        env.step(np.array([[fraction, 0.0]]))
+        speeds.append(env._qvel[0, 6])
+    return np.array(speeds)
+
+
+@pytest.mark.parametrize("lag_s", [0.05, 0.1, 0.3])
+def test_motors_reach_63_percent_of_a_small_step_after_their_lag(lag_s: float) -> None:
+    n_periods = round(lag_s / 0.01)
+    final = wheel_speeds(8 * n_periods, 0.1, motor_lag_s=lag_s)[-1]
+
+    assert wheel_speeds(n_periods, 0.1, motor_lag_s=lag_s)[-1] / final == pytest.approx(1 - np.exp(-1), rel=0.03)
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.05, 0.1, 0.25, 0.4])
+def test_a_delayed_command_moves_the_wheels_so_much_later(delay_s: float) -> None:
+    moving = np.abs(wheel_speeds(45, 0.5, command_delay_s=delay_s)) > 0.05
+
+    assert np.argmax(moving) == round(delay_s / 0.01)  # the period that begins then
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.05, 0.1, 0.25, 0.4])
+def test_a_unicycle_stands_still_for_the_delay_too(delay_s: float) -> None:
+    env = make("Unicycle", Randomization.fixed(command_delay_s=delay_s))
+    env.reset(seed=0, options={"start": (5, 2), "goal": (0, 0), "heading_rad": 0.0})
+    for _ in range(5):
+        *_, info = env.step(np.array([[1.0, 0.0]]))
+
+    # One second less the delay, at 5.969 rad/s on a wheel of 0.033 m.
+    assert info["path_length_m"][0] == pytest.approx((1.0 - delay_s) * 5.969 * 0.033)
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_wheels_do_not_move_for_commands_in_the_deadband(world: str) -> None:
+    # By hand: a fifth of the top speed is 0.039 m/s, three tenths 0.059.
+    assert mean_speeds(world, (0.2, 0.0), command_deadband_m_s=0.05)[0] < 0.001
+    assert mean_speeds(world, (0.3, 0.0), command_deadband_m_s=0.05)[0] > 0.05
+
+
+def test_a_robot_on_a_slope_slides_down_where_its_wheels_have_no_hold() -> None:
+    slope = Randomization.fixed(floor_tilt_rad=0.1, wheel_friction=0.05, caster_friction=0.02)
+    env = make("DiffDrive", slope, 8)
+    poses = [env.reset(seed=0, options={"start": (5, 5), "goal": (0, 0)})[1]["pose"]]
+    for _ in range(5):
+        poses.append(env.step(np.zeros((8, 2)))[-1]["pose"])
+
+    gravity = env._physics._field("opt.gravity")
+    np.testing.assert_allclose(np.linalg.norm(gravity, axis=1), 9.81)
+    np.testing.assert_allclose(np.arccos(-gravity[:, 2] / 9.81), 0.1)
+    assert len(np.unique(np.round(gravity[:, 0], 6))) == 8  # every episode its own direction
+    moved = poses[-1][:, :2] - poses[0][:, :2]
+    down = gravity[:, :2] / np.linalg.norm(gravity[:, :2], axis=1, keepdims=True)
+    # Between g (sin 0.1 - 0.05) and g (sin 0.1 - 0.02), over half the square of a second: 0.24 to 0.39 m.
+    along = (moved * down).sum(axis=1)
+    assert (along > 0.2).all() and (along < 0.4).all()
+
+    held = make("DiffDrive", Randomization.fixed(floor_tilt_rad=0.1), 8)
+    before = held.reset(seed=0, options={"start": (5, 5), "goal": (0, 0)})[1]["pose"]
+    for _ in range(5):
+        after = held.step(np.zeros((8, 2)))[-1]["pose"]
+    assert np.linalg.norm(after[:, :2] - before[:, :2], axis=1).max() < 0.03
+
+
+def test_masses_inertias_and_centres_are_those_drawn() -> None:
+    values = {"mass": 1.2, "payload_kg": 1.0, "yaw_inertia": 5.0, "centre_x_m": 0.02, "centre_z_m": -0.03}
+    env = make("DiffDrive", Randomization.fixed(**values))
+    env.reset(seed=0)
+    model, field = env.model, env._physics._field
+    base = model.body("base").id
+
+    # By hand: 0.945 * 1.2 + 1 = 2.134 kg, 2.2582 times as much; z has five times that inertia.
+    assert field("body_mass")[0, base] == pytest.approx(2.134)
+    np.testing.assert_allclose(
+        field("body_inertia")[0, base] / model.body_inertia[base], [2.258201, 2.258201, 11.291005], rtol=1e-6
+    )
+    np.testing.assert_allclose(field("body_ipos")[0, base], [-0.01, 0.0, 0.017])
+
+
+def test_a_robot_with_more_yaw_inertia_takes_longer_to_turn() -> None:
+    def turned(inertia: float) -> float:
+        env = make("DiffDrive", Randomization.fixed(yaw_inertia=inertia))
+        env.reset(seed=0, options={"start": (5, 2), "goal": (0, 0), "heading_rad": 0.0})
+        return float(env.step(np.array([[0.0, 1.0]]))[-1]["pose"][0, 2])
+
+    assert turned(30.0) < 0.9 * turned(1.0)
+
+
+def test_pushes_come_at_their_intervals_and_are_as_strong_as_drawn() -> None:
+    env = make("DiffDrive", Randomization.fixed(push_speed_m_s=0.3, push_turn_rad_s=2.0, push_interval_s=1.0), 64)
+    env.reset(seed=0)
+    pushed_at, velocities = [], np.zeros((64, 8))
+    for step in range(16):
+        velocities[:] = 0.0
+        env._physics.begin_period(np.full(64, step), 0.2, None, velocities)
+        if velocities.any():
+            pushed_at.append(step)
+            np.testing.assert_allclose(np.hypot(velocities[:, 0], velocities[:, 1]), 0.3)
+            assert np.abs(velocities[:, 5]).max() <= 2.0 < 2.1 * np.abs(velocities[:, 5]).max()
+            # Any direction: the mean of 64 of them is within 4 / sqrt(64) of nothing.
+            assert np.abs(velocities[:, [0, 1, 5]].mean(axis=0) / [0.3, 0.3, 2.0]).max() < 0.4
+
+    assert pushed_at == [5, 10, 15]  # seconds 1, 2 and 3
+    poses = [env.reset(seed=0, options={"heading_rad": 0.0})[1]["pose"]]
+    for _ in range(6):
+        poses.append(env.step(np.zeros((64, 2)))[-1]["pose"])
+    way = np.linalg.norm(np.diff(poses, axis=0)[..., :2], axis=-1).mean(axis=1)
+    assert way[5] > 5 * way[:5].max()  # what drives through the sixth period was pushed
+
+
+def test_what_is_drawn_for_many_episodes_does_not_add_up() -> None:
+    env = make("DiffDrive", "burger", 4, layout="classic")
+    for _ in range(20):
+        env.reset()
+        env.step(np.ones((4, 2)))
+
+    env._draws.values[:] = [PARAMETERS[name].nominal for name in NAMES]
+    env._physics.apply(np.arange(4))
+    env._physics.begin_period(np.zeros(4, dtype=np.int64), 0.2, np.zeros(4), np.zeros((4, 8)))
+
+    assert len(env._physics._fields) > 10
+    for name, values in env._physics._fields.items():
+        part, _, rest = name.partition(".")
+        nominal = getattr(env.model.opt, rest) if rest else getattr(env.model, part)
+        np.testing.assert_allclose(values, np.broadcast_to(nominal, values.shape), rtol=1e-12, err_msg=name)
