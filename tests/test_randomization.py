@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ from command_line import run_cli
 from test_env_state import assert_equal, through_files
 
 import gridnav  # noqa: F401, registers the worlds
-from gridnav.agents import Agent
+from gridnav.agents import Planner, Progress
 from gridnav.envs import (
     PARAMETERS,
     RANDOMIZATION_PRESETS,
@@ -23,9 +25,16 @@ from gridnav.envs import (
     Range,
 )
 from gridnav.envs.draws import NAMES, STEP, WINDOW, Curriculum, Draws
+from gridnav.experiment.evaluation import EVALUATION_SEED, evaluate_in
+from gridnav.experiment.results import open_log
+from gridnav.experiment.rollouts import Rollouts, load_rollouts, save_rollouts
+from gridnav.experiment.run_directory import RunDirectory
+from gridnav.experiment.training import Budget, Choice, Workshop
+from gridnav.experiment.worlds import Problem
 from gridnav.problem.layout import NAMED_LAYOUTS, Layout
 from gridnav.problem.types import FloatArray, InputError, State
 
+ROOT = Path(__file__).resolve().parents[1]
 WORLDS = ("Unicycle", "DiffDrive")
 MAZES = Randomization.load({"preset": "burger", "obstacles_moved": [0, 6], "cell_size": [0.9, 1.1]})
 
@@ -594,3 +603,359 @@ def test_what_is_drawn_for_many_episodes_does_not_add_up() -> None:
         part, _, rest = name.partition(".")
         nominal = getattr(env.model.opt, rest) if rest else getattr(env.model, part)
         np.testing.assert_allclose(values, np.broadcast_to(nominal, values.shape), rtol=1e-12, err_msg=name)
+
+
+# ---- Commands ------------------------------------------------------------------------------------
+
+
+def passed_on(n_steps: int, n: int, **values: float) -> tuple[FloatArray, FloatArray]:
+    """Commands of robots, all of them different, and what was in force, shape ``(n_steps, n, 2)`` each."""
+    env = make("Unicycle", Randomization.fixed(**values), n)
+    env.reset(seed=0)
+    told = np.random.default_rng(0).uniform(0.3, 1.0, (n_steps, n, 2))
+    return told, np.array([env._commands.pass_on(told[k], np.full(n, k)).copy() for k in range(n_steps)])
+
+
+def test_commands_are_lost_as_often_as_drawn_and_the_one_before_stays_in_force() -> None:
+    told, in_force = passed_on(100, 100, command_loss=0.2)
+    lost = (in_force != told).any(axis=2)
+
+    # 10 000 commands: a share of 0.2 within four standard errors, 4 sqrt(0.2 * 0.8 / 10 000).
+    assert lost.mean() == pytest.approx(0.2, abs=0.016)
+    once = lost[2:] & ~lost[1:-1]
+    np.testing.assert_array_equal(in_force[2:][once], told[1:-1][once])
+
+
+def test_lost_commands_come_in_rows_and_after_half_a_second_of_silence_the_robot_stops() -> None:
+    told, in_force = passed_on(100, 100, command_loss=0.05, command_loss_length=4.0)
+    lost = (in_force != told).any(axis=2)
+
+    begins = np.argwhere(lost[1:90] & ~lost[:89])
+    for step, robot in begins[:50] + [1, 0]:
+        assert lost[step : step + 4, robot].all()
+        # After 0.2 and 0.4 s of silence the last command is in force, after 0.6 and 0.8 s none.
+        np.testing.assert_array_equal(in_force[step : step + 2, robot], told[[step - 1] * 2, robot])
+        assert (in_force[step + 2 : step + 4, robot] == 0.0).all()
+
+
+def test_commands_are_passed_on_in_steps() -> None:
+    _, in_force = passed_on(20, 10, command_quantum=0.02)
+
+    steps = in_force * [5.969 * 0.033, 2 * 5.969 * 0.033 / 0.16] / 0.02  # 0.02 m/s and 0.02 rad/s
+    is_full = in_force == 1.0
+    np.testing.assert_allclose(steps[~is_full], np.rint(steps[~is_full]), atol=1e-9)
+    assert len(np.unique(np.rint(steps[..., 0]))) > 5
+
+
+def test_jitter_adds_up_to_its_length_to_the_delay() -> None:
+    env = make("Unicycle", Randomization.fixed(command_delay_s=0.1, command_jitter_s=0.06), 500)
+    env.reset(seed=0)
+    delays = env._commands.delays_s(np.zeros(500, dtype=np.int64))
+
+    # Uniform from 0.1 to 0.16: mean 0.13 within four standard errors, 4 * 0.06 / sqrt(12 * 500).
+    assert 0.1 <= delays.min() < 0.101 and 0.159 < delays.max() < 0.16
+    assert delays.mean() == pytest.approx(0.13, abs=0.0031)
+    assert (delays != env._commands.delays_s(np.ones(500, dtype=np.int64))).all()
+
+
+# ---- Senses --------------------------------------------------------------------------------------
+
+
+def sensing(n: int = 1, **values: float) -> Any:
+    """Unicycles at one place of ``classic``, whose senses vary."""
+    env = make("Unicycle", Randomization.fixed(**values), n, layout="classic")
+    env.reset(seed=0, options={"start": (0, 0), "goal": (9, 9), "heading_rad": -0.3})
+    return env
+
+
+def test_ranges_are_scaled_and_shifted_but_for_those_that_find_nothing() -> None:
+    env = sensing(lidar_scale=1.1, lidar_bias_m=-0.1)
+    true = env.scan()[0]
+
+    found = true < 3.5
+    assert found.any() and not found.all()
+    np.testing.assert_allclose(env._senses.ranges_m[0][found], np.minimum(1.1 * true[found] - 0.1, 3.5))
+    assert (env._senses.ranges_m[0][~found] == 3.5).all()
+
+
+def test_the_noise_of_a_range_grows_with_it() -> None:
+    env = sensing(4000, lidar_noise_m=0.01, lidar_noise=0.03)
+    true = env.scan()[0]
+    beams = (true > 0.2) & (true < 3.0)  # neither end of the scale cuts the noise
+
+    error = env._senses.ranges_m[:, beams] - true[beams]
+
+    # 4000 robots give a standard deviation to within four times 1 / sqrt(8000).
+    np.testing.assert_allclose(error.std(axis=0), 0.01 + 0.03 * true[beams], rtol=0.05)
+    assert np.abs(error.mean(axis=0) / (0.01 + 0.03 * true[beams])).max() < 0.07
+    assert np.abs(np.corrcoef(error.T) - np.eye(beams.sum())).max() < 0.08  # each beam errs by itself
+
+
+def test_beams_drop_out_as_often_as_drawn_and_dark_ones_side_by_side_for_the_whole_episode() -> None:
+    env = sensing(1000, lidar_dropout=0.1)
+    found = env.scan() < 3.5
+    first = env._senses.ranges_m == 3.5
+    env.step(np.zeros((1000, 2)))
+    assert first[found].mean() == pytest.approx(0.1, abs=0.01)
+    assert ((env._senses.ranges_m == 3.5) & first)[found].mean() == pytest.approx(0.01, abs=0.003)
+
+    env = sensing(50, lidar_dark_beams=3.0)
+    dark = env._senses._is_dark.copy()
+    for _ in range(3):
+        np.testing.assert_array_equal(env._senses.ranges_m, np.where(dark, 3.5, env.scan()))
+        env.step(np.zeros((50, 2)))
+    assert (dark.sum(axis=1) == 3).all()
+    assert ((dark & ~np.roll(dark, 1, axis=1)).sum(axis=1) == 1).all()  # one row of them, on the circle
+    assert len(np.unique(dark.argmax(axis=1))) > 10
+
+
+def test_a_lidar_turned_by_one_beam_counter_clockwise_sees_with_each_beam_what_the_next_one_should() -> None:
+    env = sensing(lidar_yaw_rad=2 * np.pi / 24)
+
+    np.testing.assert_allclose(env._senses.ranges_m[0], np.roll(env.scan()[0], -1))
+
+
+def driven(n_steps: int, action: tuple[float, float], **values: float) -> tuple[Any, FloatArray]:
+    """Robots after some steps, and their poses so far, the present one last."""
+    env = sensing(**values)
+    poses = [env._pose.copy()]
+    for _ in range(n_steps):
+        poses.append(env.step(np.array([action]))[-1]["pose"])
+    return env, np.array(poses)[:, 0]
+
+
+def test_a_late_scan_is_that_of_where_the_robot_was() -> None:
+    whole, poses = driven(6, (0.8, 0.3), lidar_delay_s=0.4)
+    np.testing.assert_allclose(whole._senses.ranges_m[0], whole.scan(poses[-3:-2])[0])
+
+    half, poses = driven(6, (0.8, 0.3), lidar_delay_s=0.1)
+    between = (poses[-1:] + poses[-2:-1]) / 2
+    np.testing.assert_allclose(half._senses.ranges_m[0], half.scan(between)[0])
+
+    _, still = driven(1, (0.8, 0.3), lidar_delay_s=0.4)
+    at_first, _ = driven(1, (0.8, 0.3), lidar_delay_s=0.4)
+    np.testing.assert_allclose(at_first._senses.ranges_m[0], at_first.scan(still[:1])[0])  # it stood still before
+
+
+def test_the_beams_of_a_turn_are_taken_one_after_the_other_counter_clockwise() -> None:
+    env, poses = driven(5, (0.0, 1.0), lidar_skew=1.0)
+    turn_rad_s = (poses[-1, 2] - poses[-2, 2]) / 0.2
+
+    for beam in range(24):
+        # By hand: beam 0 was taken 0.2 s ago, beam 12 0.1 s ago, and the last one 0.2 / 24 s ago.
+        pose = poses[-1:] - [0.0, 0.0, turn_rad_s * 0.2 * (24 - beam) / 24]
+        assert env._senses.ranges_m[0, beam] == pytest.approx(env.scan(pose)[0, beam])
+
+
+def test_a_slow_lidar_gives_each_scan_as_often_as_it_must() -> None:
+    env = sensing(lidar_period_s=0.4, lidar_noise_m=0.02)
+    scans = []
+    for _ in range(6):
+        env.step(np.array([[0.8, 0.3]]))
+        scans.append(env._senses.ranges_m[0].copy())
+
+    # Scans are taken at 0, 0.4, 0.8, 1.2 s; at 0.2, 0.4, ... 1.2 s the last of them is seen, noise and all.
+    same = [np.array_equal(one, other) for one, other in zip(scans, scans[1:], strict=False)]
+    assert same == [False, True, False, True, False]
+
+
+def test_a_slow_and_late_lidar_shows_the_newest_scan_that_has_arrived() -> None:
+    env, poses = driven(6, (0.8, 0.3), lidar_period_s=0.4, lidar_delay_s=0.3)
+
+    # At 1.2 s what was taken at 0.8 s has arrived, at 1.1 s, and what is taken now has not.
+    np.testing.assert_allclose(env._senses.ranges_m[0], env.scan(poses[4:5])[0])
+
+
+def test_a_drifting_heading_bends_the_estimated_way_to_its_own_side() -> None:
+    env, poses = driven(20, (1.0, 0.0), heading_drift_rad_s=0.1, localization_s=1000.0)
+    estimated = env._senses.poses[0]
+
+    # By hand: 4 s of 0.1 rad/s, counter-clockwise; on 0.79 m the estimate ends to the left by about half of that angle.
+    assert estimated[2] - poses[-1, 2] == pytest.approx(0.4, abs=0.002)
+    ahead, left = np.array([np.cos(0.3), -np.sin(0.3)]), np.array([np.sin(0.3), np.cos(0.3)])
+    off = estimated[:2] - poses[-1, :2]
+    way_m = (poses[-1, :2] - poses[0, :2]) @ ahead
+    assert off @ left == pytest.approx(way_m * 0.2, rel=0.07)
+    assert off @ ahead == pytest.approx(-way_m * 0.4**2 / 6, rel=0.15)
+
+
+def test_localisation_pulls_the_estimate_back_to_the_truth() -> None:
+    env, poses = driven(80, (0.0, 0.5), heading_drift_rad_s=0.1, localization_s=2.0)
+
+    # By hand: an error e becomes (e + 0.1 * 0.2) exp(-0.1), which rests at 0.02 / (exp(0.1) - 1) = 0.1902 rad.
+    error = (env._senses.poses[0, 2] - poses[-1, 2] + np.pi) % (2 * np.pi) - np.pi
+    assert error == pytest.approx(0.02 / (np.exp(0.1) - 1), rel=1e-3)
+
+
+def test_a_wrong_odometer_takes_the_way_for_longer() -> None:
+    env, poses = driven(20, (1.0, 0.0), odometry_scale=1.1, localization_s=1000.0)
+
+    way = poses[-1, :2] - poses[0, :2]
+    np.testing.assert_allclose(env._senses.poses[0, :2] - poses[0, :2], 1.1 * way, rtol=1e-3)
+
+
+def test_noise_of_the_position_is_new_at_every_step_and_that_of_the_goal_lasts_for_the_episode() -> None:
+    env = sensing(2000, position_noise_m=0.02, goal_noise_m=0.03)
+    noise, goals = [], []
+    for _ in range(2):
+        noise.append(env._senses.poses[:, :2] - env._pose[:, :2])
+        goals.append(env._senses.goals_w.copy())
+        env.step(np.zeros((2000, 2)))
+
+    np.testing.assert_allclose(np.std(noise), 0.02, rtol=0.04)
+    assert np.abs(np.mean(noise[0] * noise[1])) < 0.02**2 * 0.07
+    np.testing.assert_array_equal(goals[0], goals[1])
+    np.testing.assert_allclose((goals[0] - env._goal_w).std(), 0.03, rtol=0.06)
+
+
+def test_estimates_never_leave_the_maze() -> None:
+    env = sensing(500, position_noise_m=0.5, goal_noise_m=0.5)
+    for points in (env._senses.poses[:, :2], env._senses.goals_w):
+        assert (points >= 0.0).all() and (points <= 5.0).all()
+
+
+@pytest.mark.parametrize("period_s", [0.05, 0.2, 0.5])
+def test_the_longest_delays_are_remembered_whatever_the_control_period(period_s: float) -> None:
+    worst = Randomization.fixed(lidar_delay_s=0.4, lidar_period_s=0.4, lidar_skew=1.0)
+    env = make("Unicycle", worst, control_period_s=period_s)
+    ages_s, _ = env._senses._scan_times(slice(None), np.arange(1000, 1001))
+
+    assert ages_s.max() / period_s < env._senses._past.shape[1] - 1
+
+
+# ---- Mazes ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMED_LAYOUTS)
+def test_moved_walls_are_as_many_and_shut_no_goal_off(name: str) -> None:
+    layout, rng = Layout.load(name), np.random.default_rng(0)
+    n_moved = []
+    for _ in range(20):
+        varied = layout.with_moved_walls(5, rng)  # a layout that shuts a goal off cannot be made
+        assert varied.walls.sum() == layout.walls.sum()
+        if (layout.starts != ~layout.walls).any():
+            np.testing.assert_array_equal(varied.starts, layout.starts)
+        if (layout.goals != ~layout.walls).any():
+            np.testing.assert_array_equal(varied.goals, layout.goals)
+        assert (varied.reachable == ~varied.walls).all() or not (layout.reachable == ~layout.walls).all()
+        n_moved.append(int((varied.walls & ~layout.walls).sum()))
+
+    assert max(n_moved) <= 5
+    assert name == "open" or max(n_moved) >= 3
+
+
+def test_moved_walls_separate_no_start_from_its_goal_where_a_part_was_shut_off_before() -> None:
+    """Two regions may become two others: what counts is that start and goal stay in the same one."""
+    layout = Layout.from_text("S..G\n####\n....\n....")
+    for seed in range(50):
+        layout.with_moved_walls(4, np.random.default_rng(seed))
+
+
+def test_the_cells_that_a_reset_names_stay_free() -> None:
+    env = make("Unicycle", Randomization.fixed(obstacles_moved=12.0), layout="four-rooms")
+    layouts = set()
+    for seed in range(20):
+        env.reset(seed=seed, options={"start": (2, 2), "goal": (8, 8)})
+        layouts.add(env.layout)
+        assert env.start_and_goal(0) == ((2, 2), (8, 8))
+        assert env.layout.reachable[8, 8]
+
+    assert len(layouts) == 20
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_the_size_of_cells_changes_the_maze_and_nothing_else(world: str) -> None:
+    env = make(world, Randomization.fixed(cell_size=1.2), layout="classic")
+    observation, info = env.reset(seed=0, options={"start": (0, 0), "goal": (9, 9), "heading_rad": 0.0})
+
+    # By hand: cells of 0.6 m; the start's centre is at (0.3, 5.7) m. A cell-time is 1.2 times as long.
+    assert env.layout.cell_size_m == pytest.approx(0.6)
+    np.testing.assert_allclose(info["pose"][0], [0.3, 5.7, 0.0])
+    assert env.observation_space.contains(observation)
+    assert env.step_s == pytest.approx(0.2)
+    assert env.step_duration == pytest.approx(0.2 * 5.969 * 0.033 / 0.6)
+
+
+# ---- From training to files ----------------------------------------------------------------------
+
+
+def plan_of(problem: Problem) -> Planner:
+    return Planner.solve(problem.layout, problem.task, problem.reward)
+
+
+def test_every_evaluated_episode_says_what_it_drew_and_keeps_it_in_its_files(tmp_path: Path) -> None:
+    problem = Problem.load("S...\n....\n...G", "default", "default", "burger")
+    episodes = evaluate_in(problem, plan_of(problem), "Unicycle", 3)
+    env = problem.worlds("Unicycle", 3)
+    _, info = env.reset(seed=EVALUATION_SEED)
+
+    for i, episode in enumerate(episodes):
+        assert episode.randomization == {name: drawn[i] for name, drawn in info["randomization"].items()}
+        assert episode.randomization.keys() == set(problem.randomization.names)
+    save_rollouts(tmp_path, Rollouts("ahead", "Unicycle", "nobody", {"custom": problem.layout}, episodes))
+    loaded = load_rollouts(tmp_path, "ahead")
+    assert [one.randomization for one in loaded.episodes] == [one.randomization for one in episodes]
+
+    rows = json.loads((tmp_path / "ahead.json").read_text(encoding="utf-8"))
+    for hostile in ({"battery_v": "full"}, {"battery_v": True}, {"battery_v": None}, [["battery_v", 9.0]], "battery"):
+        changed = json.loads(json.dumps(rows))
+        changed["rows"][1]["randomization"] = hostile
+        (tmp_path / "ahead.json").write_text(json.dumps(changed), encoding="utf-8")
+        with pytest.raises(InputError, match="are damaged"):
+            load_rollouts(tmp_path, "ahead")
+
+
+def test_evaluation_leaves_the_maze_as_it_is_and_takes_the_whole_ranges_of_a_curriculum() -> None:
+    problem = Problem.load("classic", "default", "default", '{"preset": "curriculum", "obstacles_moved": [1, 5]}')
+
+    evaluated = problem.for_evaluation.randomization
+
+    assert evaluated == RANDOMIZATION_PRESETS["wide"]
+    assert isinstance(problem.training_worlds("Unicycle", 32), LayoutMix)
+
+
+def test_a_training_with_a_curriculum_that_breaks_off_goes_on_bit_for_bit(tmp_path: Path) -> None:
+    """Its strength, its counts, what was drawn and what is under way to the motors are in the checkpoints."""
+    changes = {
+        "num_envs": "8", "steps": "6400", "hidden": "[16]", "n_steps": "8", "batch_size": "32", "n_validations": "4",
+        "validation_episodes": "2",
+    }  # fmt: skip
+
+    def train(path: Path, *, crash_at: int = 0, begins: bool = True) -> RunDirectory:
+        if begins:
+            with RunDirectory.create(path, "train", {}) as run:
+                pass
+        run, reports = RunDirectory.open(path), iter(range(1, 1000))
+
+        def on_progress(progress: Progress) -> None:
+            if next(reports) == crash_at:
+                raise KeyboardInterrupt
+
+        problem = Problem.load("S...\n.#..\n...G", "default", "default", "curriculum")
+        with open_log(run) as log:
+            workshop = Workshop(problem, Budget(0.1, 2), 0, run, log, lambda name: on_progress, checkpoint_s=0.0)
+            workshop.train("ppo", "ppo", "Unicycle", choice=Choice(changes=changes))
+        return run
+
+    whole = train(tmp_path / "whole")
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path / "broken", crash_at=5)
+    broken = train(tmp_path / "broken", begins=False)
+
+    names = {str(part.relative_to(whole.path)) for part in whole.checkpoints.glob("*/*.safetensors")}
+    assert names
+    for name in names | {"metrics.jsonl"}:
+        assert (whole.path / name).read_bytes() == (broken.path / name).read_bytes(), name
+
+
+# ---- Documentation -------------------------------------------------------------------------------
+
+
+def test_the_documented_table_of_quantities_is_that_of_the_code() -> None:
+    result = subprocess.run(
+        [sys.executable, str(ROOT / "scripts" / "quantities.py")], capture_output=True, text=True, timeout=60, check=True
+    )
+    page = (ROOT / "docs" / "randomization.md").read_text(encoding="utf-8")
+
+    assert [line.split("`")[1] for line in result.stdout.splitlines()[2:]] == list(PARAMETERS)
+    assert result.stdout in page, "renew the table: python scripts/quantities.py"

@@ -10,7 +10,7 @@ from gridnav.agents import Agent
 from gridnav.display.recording import send_recording
 from gridnav.experiment.evaluation import evaluate, policy_for
 from gridnav.experiment.policy_maps import policy_maps
-from gridnav.experiment.worlds import Problem
+from gridnav.experiment.worlds import UNITS, Problem
 
 LIVE_SEED = 3_000_000
 """Seed of the episodes that are watched."""
@@ -62,5 +62,5 @@ class Spectator:
         maps = policy_maps(self._problem, agent, world, [episode.goal], observation=observation)
         title = f"{name} after {steps:,} steps"
         rollout, shown = {name: episode}, {name: maps[episode.goal]}
-        send_recording(self._address, self._problem.layout, rollout, maps=shown, title=title)
+        send_recording(self._address, self._problem.layout, rollout, maps=shown, title=title, units=UNITS)
         self._sent += 1
