@@ -78,7 +78,9 @@ class UnicycleVectorEnv(RobotVectorEnv):
         if self.randomization.acts_on("command"):
             self._told[1:] = self._told[:-1]
             self._told[0] = wheels
-            back = np.clip(self._commands.delays_s(self._steps) / self.control_period_s, 0.0, len(self._told) - 1.000001)
+            back = np.clip(
+                self._commands.delays_s(self._steps) / self.control_period_s, 0.0, len(self._told) - 1.000001
+            )
             newer, ids = back.astype(np.int64), np.arange(self.num_envs)
             late = (back - newer)[:, None]
             wheels = (1.0 - late) * self._told[newer, ids] + late * self._told[newer + 1, ids]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from command_line import run_cli
+from gridnav.envs.draws import NAMES, STEP, WINDOW, Curriculum, Draws
 from test_env_state import assert_equal, through_files
 
 import gridnav  # noqa: F401, registers the worlds
@@ -24,7 +26,6 @@ from gridnav.envs import (
     Randomization,
     Range,
 )
-from gridnav.envs.draws import NAMES, STEP, WINDOW, Curriculum, Draws
 from gridnav.experiment.evaluation import EVALUATION_SEED, evaluate_in
 from gridnav.experiment.results import open_log
 from gridnav.experiment.rollouts import Rollouts, load_rollouts, save_rollouts
@@ -181,7 +182,8 @@ def test_draws_follow_their_laws_and_fill_their_ranges() -> None:
     assert drawn["battery_v"].std() == pytest.approx(3 / np.sqrt(12), rel=0.02)
     # Log: half of them below the geometric mean, sqrt(0.5 * 8) = 2.
     assert (drawn["yaw_inertia"] < 2.0).mean() == pytest.approx(0.5, abs=0.015)
-    assert 0.5 <= drawn["yaw_inertia"].min() < 0.502 and 7.98 < drawn["yaw_inertia"].max() <= 8.0
+    assert 0.5 <= drawn["yaw_inertia"].min() < 0.502
+    assert 7.98 < drawn["yaw_inertia"].max() <= 8.0
     # The size of a noise says nothing of its first values: the correlation of 20 000 pairs is within 4 / sqrt(20 000).
     first = drawn.normals("lidar_noise_m", np.zeros(20_000, dtype=np.int64), 1)[:, 0]
     assert abs(np.corrcoef(np.abs(first), drawn["lidar_noise_m"])[0, 1]) < 0.03
@@ -533,7 +535,8 @@ def test_a_robot_on_a_slope_slides_down_where_its_wheels_have_no_hold() -> None:
     down = gravity[:, :2] / np.linalg.norm(gravity[:, :2], axis=1, keepdims=True)
     # Between g (sin 0.1 - 0.05) and g (sin 0.1 - 0.02), over half the square of a second: 0.24 to 0.39 m.
     along = (moved * down).sum(axis=1)
-    assert (along > 0.2).all() and (along < 0.4).all()
+    assert (along > 0.2).all()
+    assert (along < 0.4).all()
 
     held = make("DiffDrive", Randomization.fixed(floor_tilt_rad=0.1), 8)
     before = held.reset(seed=0, options={"start": (5, 5), "goal": (0, 0)})[1]["pose"]
@@ -631,7 +634,7 @@ def test_lost_commands_come_in_rows_and_after_half_a_second_of_silence_the_robot
     lost = (in_force != told).any(axis=2)
 
     begins = np.argwhere(lost[1:90] & ~lost[:89])
-    for step, robot in begins[:50] + [1, 0]:
+    for step, robot in [*begins[:50], 1, 0]:
         assert lost[step : step + 4, robot].all()
         # After 0.2 and 0.4 s of silence the last command is in force, after 0.6 and 0.8 s none.
         np.testing.assert_array_equal(in_force[step : step + 2, robot], told[[step - 1] * 2, robot])
@@ -653,7 +656,8 @@ def test_jitter_adds_up_to_its_length_to_the_delay() -> None:
     delays = env._commands.delays_s(np.zeros(500, dtype=np.int64))
 
     # Uniform from 0.1 to 0.16: mean 0.13 within four standard errors, 4 * 0.06 / sqrt(12 * 500).
-    assert 0.1 <= delays.min() < 0.101 and 0.159 < delays.max() < 0.16
+    assert 0.1 <= delays.min() < 0.101
+    assert 0.159 < delays.max() < 0.16
     assert delays.mean() == pytest.approx(0.13, abs=0.0031)
     assert (delays != env._commands.delays_s(np.ones(500, dtype=np.int64))).all()
 
@@ -673,7 +677,8 @@ def test_ranges_are_scaled_and_shifted_but_for_those_that_find_nothing() -> None
     true = env.scan()[0]
 
     found = true < 3.5
-    assert found.any() and not found.all()
+    assert found.any()
+    assert not found.all()
     np.testing.assert_allclose(env._senses.ranges_m[0][found], np.minimum(1.1 * true[found] - 0.1, 3.5))
     assert (env._senses.ranges_m[0][~found] == 3.5).all()
 
@@ -755,7 +760,7 @@ def test_a_slow_lidar_gives_each_scan_as_often_as_it_must() -> None:
         scans.append(env._senses.ranges_m[0].copy())
 
     # Scans are taken at 0, 0.4, 0.8, 1.2 s; at 0.2, 0.4, ... 1.2 s the last of them is seen, noise and all.
-    same = [np.array_equal(one, other) for one, other in zip(scans, scans[1:], strict=False)]
+    same = [np.array_equal(one, other) for one, other in itertools.pairwise(scans)]
     assert same == [False, True, False, True, False]
 
 
@@ -811,7 +816,8 @@ def test_noise_of_the_position_is_new_at_every_step_and_that_of_the_goal_lasts_f
 def test_estimates_never_leave_the_maze() -> None:
     env = sensing(500, position_noise_m=0.5, goal_noise_m=0.5)
     for points in (env._senses.poses[:, :2], env._senses.goals_w):
-        assert (points >= 0.0).all() and (points <= 5.0).all()
+        assert (points >= 0.0).all()
+        assert (points <= 5.0).all()
 
 
 @pytest.mark.parametrize("period_s", [0.05, 0.2, 0.5])
@@ -953,7 +959,11 @@ def test_a_training_with_a_curriculum_that_breaks_off_goes_on_bit_for_bit(tmp_pa
 
 def test_the_documented_table_of_quantities_is_that_of_the_code() -> None:
     result = subprocess.run(
-        [sys.executable, str(ROOT / "scripts" / "quantities.py")], capture_output=True, text=True, timeout=60, check=True
+        [sys.executable, str(ROOT / "scripts" / "quantities.py")],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
     )
     page = (ROOT / "docs" / "randomization.md").read_text(encoding="utf-8")
 

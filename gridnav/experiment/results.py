@@ -75,9 +75,7 @@ def write_rollouts(
     rollouts = {name: _here(problem, result)[number] for name, result in shown.items()}
     maps = {name: result.maps[rollouts[name].goal] for name, result in shown.items() if result.maps}
     title = f"gridnav {run.path.name}, episode {number}"
-    write_recording(
-        run.recording, problem.layout, rollouts, maps=maps, title=title, properties=properties, units=UNITS
-    )
+    write_recording(run.recording, problem.layout, rollouts, maps=maps, title=title, properties=properties, units=UNITS)
 
 
 def kept(problem: Problem, result: Result) -> Rollouts:
