@@ -19,15 +19,21 @@ from gridnav.problem.types import AnyArray, BoolArray, FloatArray, IntArray
 from .randomization import PARAMETERS, Randomization
 
 Keys = NDArray[np.uint64]
+Ids = IntArray | slice
+"""Some environments, or ``EVERYONE``."""
+EVERYONE = slice(None)
 NAMES = tuple(PARAMETERS)
 COLUMN = {name: column for column, name in enumerate(NAMES)}
 """Column of each quantity in what was drawn."""
 NOMINAL: FloatArray = np.array([parameter.nominal for parameter in PARAMETERS.values()])
-BRANCH = 0x6472
-"""Branch of an environment's seed sequence from which its key comes: no other generator uses it."""
+LOWEST: FloatArray = np.array([parameter.lowest for parameter in PARAMETERS.values()])
+HIGHEST: FloatArray = np.array([parameter.highest for parameter in PARAMETERS.values()])
+BRANCH = 0x64726177
+"""Branch of an environment's seed sequence from which its key comes: larger than any environment's number in a batch,
+so that no other generator uses it."""
 
 WINDOW = 120
-"""Episodes at the ranges' ends after which a curriculum decides."""
+"""Episodes at the present strength by which a curriculum decides."""
 WIDENS, NARROWS = 0.85, 0.6
 """Success from which on ranges widen, and below which they narrow."""
 STEP = 0.1
@@ -49,7 +55,10 @@ class Draws:
         ranges = [getattr(randomization, name) for name in self.names]
         self._is_log = np.array([one.law == "log" for one in ranges], dtype=bool)
         self._low, self._high = (np.array([getattr(one, end) for one in ranges]) for end in ("low", "high"))
-        self._ids = np.array([name_id(name) for name in self.names], dtype=np.uint64)
+        nominal = NOMINAL[self.columns]
+        self._lowest, self._highest = np.minimum(self._low, nominal), np.maximum(self._high, nominal)
+        # Other names than those of the numbers within an episode: a noise's size says nothing of its values.
+        self._ids = np.array([name_id(f"size of {name}") for name in self.names], dtype=np.uint64)
         self.values: FloatArray = np.tile(NOMINAL, (n, 1))
         """Of every quantity, in its own unit, shape ``(n, len(NAMES))``; nominal where nothing is drawn."""
         self.keys: Keys = np.zeros(n, dtype=np.uint64)
@@ -60,6 +69,7 @@ class Draws:
         """Take the environments' keys from what their generators were seeded with, without drawing from these."""
         self.keys[:] = [_key(generator) for generator in generators]
         self.episodes[:] = 0
+        self.curriculum = Curriculum.begin(len(self.keys))
 
     def draw(self, ids: IntArray) -> None:
         """Draw for the next episode of the given environments."""
@@ -68,36 +78,47 @@ class Draws:
             return
         shares = np.empty((len(ids), len(self.names)))
         _shares(self.keys[ids], self._ids, self.episodes[ids], shares)
-        low, high = self._low, self._high
+        # By the quantity's law: uniform between the ends, or so in its logarithm.
+        low, high, nominal = (self._by_law(ends) for ends in (self._low, self._high, NOMINAL[self.columns]))
         if self.randomization.curriculum:
             strength = self.curriculum.strength_for(ids, self.keys[ids], self.episodes[ids])[:, None]
-            nominal = NOMINAL[self.columns]
             low, high = nominal + strength * (low - nominal), nominal + strength * (high - nominal)
-        # By the quantity's law: uniform between the ends, or so in its logarithm.
-        safe = np.where(self._is_log, low, 1.0)
-        by_factors = safe * (np.where(self._is_log, high, 1.0) / safe) ** shares
-        self.values[np.ix_(ids, self.columns)] = np.where(self._is_log, by_factors, low + (high - low) * shares)
+        drawn = low + (high - low) * shares
+        drawn[:, self._is_log] = np.exp(drawn[:, self._is_log])
+        # The exponential of a logarithm may miss an end by the last bit.
+        self.values[np.ix_(ids, self.columns)] = np.clip(drawn, self._lowest, self._highest)
+
+    def _by_law(self, values: FloatArray) -> FloatArray:
+        """Values of the drawn quantities, or their logarithms where these are uniform."""
+        by_law = values.astype(np.float64)
+        by_law[self._is_log] = np.log(by_law[self._is_log])
+        return by_law
 
     def __getitem__(self, name: str) -> FloatArray:
         """What was drawn of a quantity, a view of shape ``(n,)``."""
         return self.values[:, COLUMN[name]]
 
-    def shares(self, name: str, counts: IntArray, n: int) -> FloatArray:
-        """Numbers in [0, 1) of this episode for a quantity, shape ``(num_envs, n)``.
+    def varies(self, *names: str) -> bool:
+        """Whether one of these quantities is not always nominal."""
+        return not set(names).isdisjoint(self.names)
+
+    def shares(self, name: str, counts: IntArray, n: int, ids: Ids = EVERYONE) -> FloatArray:
+        """Numbers in [0, 1) of this episode for a quantity, shape ``(m, n)``.
 
         Args:
             name: The quantity, or what else a number is for.
-            counts: How often each environment asked before in this episode, shape ``(num_envs,)``.
-            n: How many numbers at once.
+            counts: How often each of these environments asked before in this episode, shape ``(m,)``.
+            n: How many numbers at once, always the same for a name.
+            ids: Which environments.
         """
-        numbers = np.empty((len(self.keys), n))
-        _fill(self.keys, np.uint64(name_id(name)), self.episodes, counts, False, numbers)
+        numbers = np.empty((len(counts), n))
+        _fill(self.keys[ids], np.uint64(name_id(name)), self.episodes[ids], counts, False, numbers)
         return numbers
 
-    def normals(self, name: str, counts: IntArray, n: int) -> FloatArray:
+    def normals(self, name: str, counts: IntArray, n: int, ids: Ids = EVERYONE) -> FloatArray:
         """The same as standard normal numbers."""
-        numbers = np.empty((len(self.keys), n))
-        _fill(self.keys, np.uint64(name_id(name)), self.episodes, counts, True, numbers)
+        numbers = np.empty((len(counts), n))
+        _fill(self.keys[ids], np.uint64(name_id(name)), self.episodes[ids], counts, True, numbers)
         return numbers
 
     def arrays(self) -> dict[str, AnyArray]:
@@ -107,7 +128,7 @@ class Draws:
             "keys": self.keys,
             "episodes": self.episodes,
             "curriculum": self.curriculum.state,
-            "is_at_end": self.curriculum.is_at_end,
+            "is_sample": self.curriculum.is_sample,
         }
 
     def info(self) -> dict[str, FloatArray]:
@@ -120,40 +141,51 @@ class Curriculum:
     """One strength for all ranges, in [0, 1], that follows the success of episodes at the present strength.
 
     Half of the episodes are at it, the others anywhere below, so that what was learnt is not forgotten (automatic
-    domain randomisation, OpenAI et al. 2019, arXiv 1910.07113, section 5).
+    domain randomisation, OpenAI et al. 2019, arXiv 1910.07113, section 5). It decides by the first ``WINDOW`` episodes
+    that *begin* at a strength, once all of them have ended: the first to end are the good ones.
     """
 
     state: FloatArray
-    """Strength, and how many of the episodes at it ended and succeeded, shape ``(3,)``."""
-    is_at_end: BoolArray
-    """Environments whose episode is at the present strength, shape ``(n,)``."""
+    """Strength, and how many of the episodes that count began, ended and succeeded, shape ``(4,)``."""
+    is_sample: BoolArray
+    """Environments whose episode counts, shape ``(n,)``."""
 
     @classmethod
     def begin(cls, n: int) -> Curriculum:
         """With strength 0."""
-        return cls(np.zeros(3), np.zeros(n, dtype=bool))
+        return cls(np.zeros(4), np.zeros(n, dtype=bool))
 
     @property
     def strength(self) -> float:
         """The present one."""
         return float(self.state[0])
 
-    def note(self, ids: IntArray, successes: BoolArray) -> None:
-        """Take note of episodes that ended; widen or narrow where enough were at the present strength."""
-        counted = self.is_at_end[ids]
-        self.state[1:] += counted.sum(), successes[counted].sum()
-        if self.state[1] >= WINDOW:
-            rate = self.state[2] / self.state[1]
+    def note(self, ids: IntArray, is_over: BoolArray, successes: BoolArray) -> None:
+        """These environments leave their episodes: widen or narrow once all that count are over.
+
+        Args:
+            ids: The environments.
+            is_over: Which of the episodes ended by themselves; others are cut short, and another one takes their place.
+            successes: Which of them arrived.
+        """
+        counts, cut = self.is_sample[ids] & is_over, self.is_sample[ids] & ~is_over
+        self.is_sample[ids] = False
+        self.state[1:] += -cut.sum(), counts.sum(), successes[counts].sum()
+        if self.state[2] >= WINDOW:
+            rate = self.state[3] / self.state[2]
             change = STEP if rate >= WIDENS else -STEP if rate < NARROWS else 0.0
-            self.state[:] = min(max(self.strength + change, 0.0), 1.0), 0, 0
-            self.is_at_end[:] = False  # what is under way was drawn at another strength
+            # Rounded, so that ten steps make 1.
+            self.state[:] = min(max(round(self.strength + change, 6), 0.0), 1.0), 0, 0, 0
 
     def strength_for(self, ids: IntArray, keys: Keys, episodes: IntArray) -> FloatArray:
         """Strength of the next episode of each environment, shape ``(len(ids),)``."""
         shares = np.empty((len(ids), 2))
         _shares(keys, np.array([name_id("curriculum"), name_id("strength")], dtype=np.uint64), episodes, shares)
-        self.is_at_end[ids] = shares[:, 0] < 0.5
-        return np.where(self.is_at_end[ids], self.strength, self.strength * shares[:, 1])
+        is_present = shares[:, 0] < 0.5
+        wanted = is_present & (self.state[1] + np.cumsum(is_present) <= WINDOW)
+        self.is_sample[ids] = wanted
+        self.state[1] += wanted.sum()
+        return np.where(is_present, self.strength, self.strength * shares[:, 1])
 
 
 def name_id(name: str) -> int:

@@ -97,6 +97,7 @@ def _sweep(
     ranges: FloatArray,
 ) -> None:
     for i in range(len(past)):
+        cos_yaw, sin_yaw = np.cos(yaws[i]), np.sin(yaws[i])
         for k in range(len(directions)):
             newer = int(ages[i, k])
             share = ages[i, k] - newer
@@ -106,8 +107,7 @@ def _sweep(
             ahead_x, ahead_y = np.cos(heading), np.sin(heading)
             x = (later[0] + share * (earlier[0] - later[0]) + offset * ahead_x) / cell + 1.0
             y = (later[1] + share * (earlier[1] - later[1]) + offset * ahead_y) / cell + 1.0
-            if yaws[i] != 0.0:
-                ahead_x, ahead_y = np.cos(heading + yaws[i]), np.sin(heading + yaws[i])
+            ahead_x, ahead_y = ahead_x * cos_yaw - ahead_y * sin_yaw, ahead_x * sin_yaw + ahead_y * cos_yaw
             dx = ahead_x * directions[k, 0] - ahead_y * directions[k, 1]
             dy = ahead_x * directions[k, 1] + ahead_y * directions[k, 0]
             ranges[i, k] = min(_walk(x, y, dx, dy, walls) * cell, longest)

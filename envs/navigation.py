@@ -141,8 +141,8 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
     def _spaces(self) -> tuple[gym.Space[Any], gym.Space[Any]]:
         """Observation and action space of one robot."""
 
-    def _vary(self, layout: Layout) -> Layout:
-        """The layout of the episodes that a reset begins; worlds may change it."""
+    def _vary(self, layout: Layout, fixed: dict[str, Any]) -> Layout:
+        """The layout of the episodes that a reset begins, with what its options fix; worlds may change it."""
         return layout
 
     def _use_layout(self) -> None:
@@ -190,7 +190,7 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         fixed, layout = self._checked_options(options)
         if seed is not None:
             self.use_generators(self._generators(seed))
-        layout = self._vary(layout)
+        layout = self._vary(layout, fixed)
         if layout != self.layout:
             self.layout = layout
             self._use_layout()
@@ -250,7 +250,10 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         if values["layout"] is not None:  # a text, never a path: the state may come from a file of somebody else
             layout = Layout.from_text(values["layout"], cell_size_m=layout.cell_size_m)
         fixed, layout = self._checked_options({**values["fixed"], "layout": layout})
-        layout = replace(layout, cell_size_m=values["cell_size_m"])
+        cell_size_m = float(values["cell_size_m"])
+        if not 0.5 <= cell_size_m / layout.cell_size_m <= 2.0:
+            raise InputError(f"cells of {cell_size_m} m in the state are none of {layout.cell_size_m} m")
+        layout = replace(layout, cell_size_m=cell_size_m)
         self._check_state(arrays, layout)
         if layout != self.layout:
             self.layout = layout

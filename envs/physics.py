@@ -33,7 +33,6 @@ class Physics:
 
     def __init__(self, batch: Batch, model: mujoco.MjModel, draws: Draws) -> None:
         self._batch, self._model, self._draws = batch, model, draws
-        self._names = {name for name in draws.names}
         self._fields: dict[str, Any] = {}
         self._base = model.body("base").id
         self._wheels = [model.body(name).id for name in WHEELS]
@@ -44,17 +43,17 @@ class Physics:
 
     def apply(self, ids: IntArray) -> None:
         """Give these robots the bodies, motors and floors that were drawn for them."""
-        if not self._names:
+        if not self._draws.randomization.acts_on("physics", "drive"):
             return
         self._apply_body(ids)
         self._apply_contacts(ids)
         self._apply_motors(ids)
-        if "floor_tilt_rad" in self._names:
+        if self._varies("floor_tilt_rad"):
             self._tilt(ids)
         self._batch.set_const(ids)
 
     def _varies(self, *names: str) -> bool:
-        return not self._names.isdisjoint(names)
+        return self._draws.varies(*names)
 
     def _field(self, name: str) -> Any:
         if name not in self._fields:
@@ -106,9 +105,8 @@ class Physics:
                 self._field("dof_frictionloss")[ids, dof] = of("wheel_stiction_n_m", ids)
 
     def _tilt(self, ids: IntArray) -> None:
-        none = np.zeros(len(self._draws.keys), dtype=np.int64)
         # Direction of the slope: uniform.
-        azimuth = 2.0 * np.pi * self._draws.shares("floor_tilt_rad", none + 1, 1)[ids, 0]
+        azimuth = 2.0 * np.pi * self._draws.shares("floor_tilt_rad", np.zeros(len(ids), dtype=np.int64), 1, ids)[:, 0]
         tilt = self._of("floor_tilt_rad", ids)
         across = np.sin(tilt)
         down = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), -np.cos(tilt)], axis=1)
@@ -139,7 +137,7 @@ class Physics:
         if not is_pushed.any():
             return
         # Direction: uniform. Turn: uniform between both ways.
-        numbers = draws.shares("push_speed_m_s", steps, 2)
+        numbers = draws.shares("push", steps, 2)
         direction, speed = 2.0 * np.pi * numbers[:, 0], draws["push_speed_m_s"]
         qvel[is_pushed, 0] += (speed * np.cos(direction))[is_pushed]
         qvel[is_pushed, 1] += (speed * np.sin(direction))[is_pushed]

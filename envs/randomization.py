@@ -13,7 +13,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from gridnav.problem.strict_json import parse_object
+from gridnav.problem.strict_json import parse_object, read_object
 from gridnav.problem.types import InputError
 
 Drawn = Literal["episode", "step", "interval", "layout"]
@@ -237,7 +237,7 @@ class Randomization:
             return source
         values = dict(source) if isinstance(source, Mapping) else _read(source)
         preset = values.pop("preset", "none")
-        if preset not in PRESETS:
+        if not isinstance(preset, str) or preset not in PRESETS:
             raise InputError(f"unknown randomization {preset!r:.60}: the presets are {', '.join(PRESETS)}")
         curriculum = values.pop("curriculum", PRESETS[preset].curriculum)
         if not isinstance(curriculum, bool):
@@ -252,17 +252,30 @@ PARAMETERS: dict[str, Parameter] = {
 """Unit, nominal value, bounds, time of drawing and place of effect of each quantity."""
 
 
+MISTAKEN_UNITS: dict[str, dict[float, str]] = {
+    "s": {1e-3: "milliseconds"},
+    "m": {1e-2: "centimetres", 1e-3: "millimetres"},
+    "m/s": {1e-2: "centimetres per second", 1e-3: "millimetres per second"},
+    "rad": {0.0174533: "degrees"},
+    "rad/s": {0.0174533: "degrees per second"},
+    "kg": {1e-3: "grams"},
+    "V": {1e-3: "millivolts"},
+    "x": {1e-2: "percent"},
+    "x range": {1e-2: "percent"},
+    "1": {1e-2: "percent"},
+}
+"""By unit: what a number that is out of bounds may have been given in, with the factor to the right unit."""
+
+
 def _read(source: str | Path) -> dict[str, Any]:
     text = str(source)
-    if not text.lstrip().startswith("{"):
-        if not text.endswith(".json"):
-            return {"preset": text}
-        try:
-            text = Path(text).read_text(encoding="utf-8")
-        except (OSError, ValueError) as error:
-            raise InputError(f"randomization {text!r:.80} cannot be read: {error}") from None
+    is_text = text.lstrip().startswith("{")
+    if not is_text and not text.endswith(".json"):
+        return {"preset": text}
     try:
-        return parse_object(text)
+        return parse_object(text) if is_text else read_object(Path(text))
+    except OSError as error:
+        raise InputError(f"randomization {text!r:.80} cannot be read: {error.strerror}") from None
     except ValueError as error:
         raise InputError(f"randomization {text!r:.60} is not valid JSON: {error}") from None
 
@@ -283,26 +296,25 @@ def _range(name: str, value: Any, parameter: Parameter) -> Range:
     ends = (value.low, value.high) if isinstance(value, Range) else ()
     if not ends or not all(isinstance(end, int | float) and not isinstance(end, bool) for end in ends):
         raise InputError(f'{name} {json.dumps(value, default=str):.60} must be a number, [low, high] or with "log"')
-    low, high = float(ends[0]), float(ends[1])
-    if not low <= high:
+    low, high = (float(min(max(end, -1e99), 1e99)) for end in ends)  # a JSON number may have any number of digits
+    if low > high:
         raise InputError(f"{name} [{low:g}, {high:g}] is reversed: the first number must be the lower one")
     for end in (low, high):
         if not parameter.lowest <= end <= parameter.highest:
             raise InputError(f"{name} {end:g} is outside {_bounds(parameter)}{_unit_hint(end, parameter)}")
     if value.law not in ("uniform", "log") or (value.law == "log" and (low <= 0.0 or parameter.nominal <= 0.0)):
         raise InputError(f"{name} cannot follow the law {value.law!r:.20}: log is for positive numbers, else uniform")
-    return Range(low, high, value.law)
+    return Range(low, high, value.law if low < high else "uniform")
 
 
 def _bounds(parameter: Parameter) -> str:
-    return f"{parameter.lowest:g} to {parameter.highest:g} {parameter.unit}"
+    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+    return f"{parameter.lowest:g} to {parameter.highest:g}{unit}"
 
 
 def _unit_hint(value: float, parameter: Parameter) -> str:
     """What the number may have been meant as, where a plausible factor brings it within bounds."""
-    factors = {"s": {1e-3: "milliseconds"}, "rad": {0.0174533: "degrees"}, "rad/s": {0.0174533: "degrees per second"}}
-    factors |= {"m": {1e-2: "centimetres", 1e-3: "millimetres"}, "x": {1e-2: "percent"}, "1": {1e-2: "percent"}}
-    for factor, unit in factors.get(parameter.unit, {}).items():
+    for factor, unit in MISTAKEN_UNITS.get(parameter.unit, {}).items():
         if parameter.lowest <= value * factor <= parameter.highest:
             return f": is it in {unit}? Then write {value * factor:.3g}"
     return ""

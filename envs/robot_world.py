@@ -15,7 +15,7 @@ from gridnav.problem.geodesic import Geodesic, clearances
 from gridnav.problem.layout import Layout
 from gridnav.problem.types import AnyArray, BoolArray, FloatArray, InputError, IntArray, State
 
-from .draws import Draws
+from .draws import HIGHEST, LOWEST, Draws
 from .imperfections import Commands, Senses
 from .navigation import NavigationVectorEnv, as_array, checked_num_envs
 from .observation import FeatureVector
@@ -79,6 +79,7 @@ class RobotVectorEnv(NavigationVectorEnv):
         self._draws = Draws(self.randomization, checked_num_envs(num_envs))
         self._n_layouts = 0
         super().__init__(num_envs, **shared)
+        self._draws.use(self.generators)
 
     @property
     def step_duration(self) -> float:
@@ -99,7 +100,7 @@ class RobotVectorEnv(NavigationVectorEnv):
         self._geodesic = Geodesic(self.layout, self.robot.radius_m)
         n = self.num_envs
         self._commands = Commands(self._draws, self.robot, n, self.control_period_s)
-        self._senses = Senses(self._draws, self.robot, n, self.control_period_s)
+        self._senses = Senses(self._draws, self.robot, n, self.control_period_s, self.layout.size_m)
         self._goal_number = np.zeros(n, dtype=np.int64)
         # Direction of the wall that the bumper met last and has not left, zero without one.
         self._contact: FloatArray = np.zeros((n, 2))
@@ -144,22 +145,24 @@ class RobotVectorEnv(NavigationVectorEnv):
 
     def _begin(self, ids: IntArray) -> None:
         if self.randomization.curriculum:
-            over = ids[self._steps[ids] > 0]
-            self._draws.curriculum.note(over, self._transition.at_goal[over])
+            step = self._transition
+            is_over = (self._steps > 0) & (step.terminal | step.time_up | self._failed)
+            self._draws.curriculum.note(ids, is_over[ids], step.at_goal[ids])
         self._draws.draw(ids)
         super()._begin(ids)
 
-    def _vary(self, layout: Layout) -> Layout:
+    def _vary(self, layout: Layout, fixed: dict[str, Any]) -> Layout:
         """The layout of the next episodes: as it is, or with other walls and another size."""
         varied = self.randomization
         if not varied.acts_on("layout"):
             return layout
         self._n_layouts += 1
+        kept = [(int(fixed[end][0]), int(fixed[end][1])) for end in ("start", "goal") if end in fixed]
         rng = np.random.default_rng([int(self._draws.keys[0]), self._n_layouts])
         # Walls: uniform over the whole numbers in the range. Size: uniform.
         n_walls = int(rng.integers(round(varied.obstacles_moved.low), round(varied.obstacles_moved.high) + 1))
         size = layout.cell_size_m * rng.uniform(varied.cell_size.low, varied.cell_size.high)
-        return replace(layout.with_moved_walls(n_walls, rng), cell_size_m=size)
+        return replace(layout.with_moved_walls(n_walls, rng, kept=kept), cell_size_m=size)
 
     def use_generators(self, generators: list[np.random.Generator]) -> None:
         """Draw from these generators, one per environment; see ``NavigationVectorEnv.use_generators``."""
@@ -193,6 +196,9 @@ class RobotVectorEnv(NavigationVectorEnv):
             stored = state.arrays.get(f"imperfections.{name}")
             if stored is None or stored.shape != own.shape or stored.dtype != own.dtype:
                 raise InputError(f"{name} of the state does not fit the randomization of these environments")
+        drawn = state.arrays["imperfections.drawn"]
+        if not ((drawn >= LOWEST) & (drawn <= HIGHEST)).all():  # compiled loops trust it
+            raise InputError("what the state has drawn is outside what a randomization may draw")
         super().set_state(state)
         for name, own in self._imperfections().items():
             own[:] = state.arrays[f"imperfections.{name}"]

@@ -12,7 +12,7 @@ from gridnav.problem.geodesic import clearance
 from gridnav.problem.types import AnyArray, BoolArray, FloatArray, IntArray
 
 from .draws import COLUMN, NOMINAL
-from .imperfections import REMEMBERED
+from .imperfections import n_remembered
 from .painter import Painter
 from .robot_world import GRAZING, SAME_WALL, RobotEnv, RobotVectorEnv
 
@@ -58,7 +58,8 @@ class UnicycleVectorEnv(RobotVectorEnv):
 
     def _use_layout(self) -> None:
         super()._use_layout()
-        self._told: FloatArray = np.zeros((REMEMBERED, self.num_envs, 2))  # wheel fractions, the newest first
+        # Wheel fractions, the newest first.
+        self._told: FloatArray = np.zeros((n_remembered(self.control_period_s), self.num_envs, 2))
 
     def _place(self, ids: IntArray) -> None:
         super()._place(ids)
@@ -77,7 +78,9 @@ class UnicycleVectorEnv(RobotVectorEnv):
         if self.randomization.acts_on("command"):
             self._told[1:] = self._told[:-1]
             self._told[0] = wheels
-            back = np.clip(self._commands.delays_s(self._steps) / self.control_period_s, 0.0, REMEMBERED - 1.000001)
+            back = np.clip(
+                self._commands.delays_s(self._steps) / self.control_period_s, 0.0, len(self._told) - 1.000001
+            )
             newer, ids = back.astype(np.int64), np.arange(self.num_envs)
             late = (back - newer)[:, None]
             wheels = (1.0 - late) * self._told[newer, ids] + late * self._told[newer + 1, ids]

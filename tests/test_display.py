@@ -88,6 +88,20 @@ def test_rollouts_stand_side_by_side_on_one_timeline(tmp_path: Path) -> None:
     assert "/rollouts/grid/robot/lidar/rays" not in here, "a grid robot has no lidar to draw"
 
 
+def test_what_was_drawn_for_an_episode_is_a_table_in_its_recording(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    drawn = {"battery_v": 9.25, "lidar_scale": 1.012345}
+    rollouts = {"a|b": replace(drive(), randomization=drawn), "robot": drive()}
+
+    write_recording(path, CORRIDOR, rollouts, units={"battery_v": "V", "lidar_scale": "x"})
+
+    (text,) = columns(path, "/drawn", "TextDocument:text")[0]  # type: ignore[misc]
+    assert text.splitlines()[0] == "| quantity | a/b | unit |"
+    assert text.splitlines()[2:] == ["| battery_v | 9.25 | V |", "| lidar_scale | 1.012 | x |"]
+    write_recording(path, CORRIDOR, {"robot": drive()})
+    assert "/drawn" not in entities(path)
+
+
 def test_the_robot_stands_and_looks_where_its_trace_says(tmp_path: Path) -> None:
     path, episode = tmp_path / "run.rrd", drive(steps=3)
     assert episode.trace is not None

@@ -14,6 +14,7 @@ the processes. A recording holds rollouts on common timelines, ``sim_time`` in s
     /distance_to_goal/NAME
     /state/1_NAME                                         what it does, in words; the second rollout's is 2_NAME
     /run_card                                             what this is, in Markdown
+    /drawn                                                what was drawn for each rollout, where something varied
 
 An overlay of many episodes has ``/maze``, ``/trails``, ``/robots``, ``/ends`` and ``/arrived`` instead.
 Data goes in as columns, one call per entity: one call per step is forty times slower.
@@ -82,6 +83,7 @@ def write_recording(
     maps: Mapping[str, PolicyMap] | None = None,
     title: str = "gridnav rollout",
     properties: Mapping[str, object] | None = None,
+    units: Mapping[str, str] | None = None,
     robot: Robot = BURGER,
 ) -> None:
     """Write one or more rollouts in the same maze to an .rrd file, side by side on one timeline.
@@ -93,6 +95,7 @@ def write_recording(
         maps: Values and policy of the agents of some rollouts, by the same names, for the floor.
         title: Heading of the run card, and the recording's name in the viewer.
         properties: Seeds, command, versions: shown on the run card and stored with the recording.
+        units: Of what was drawn for the rollouts, by quantity.
         robot: Body and lidar to draw.
 
     Raises:
@@ -101,8 +104,9 @@ def write_recording(
     traces = _same_course(rollouts)
     card = _run_card(title, rollouts, properties)
     recording = rr.RecordingStream("gridnav", send_properties=False)
-    recording.save(path, default_blueprint=_side_by_side(layout, traces))
+    recording.save(path, default_blueprint=_side_by_side(layout, traces, varied=_varies(rollouts)))
     _log_head(recording, title, properties, card)
+    _log_drawn(recording, rollouts, units or {})
     _log_rollouts(recording, layout, rollouts, maps, robot)
     # Only this writes the footer that readers need.
     recording.disconnect()
@@ -115,6 +119,7 @@ def send_recording(
     *,
     maps: Mapping[str, PolicyMap] | None = None,
     title: str = "gridnav rollout",
+    units: Mapping[str, str] | None = None,
     robot: Robot = BURGER,
 ) -> None:
     """Send what ``write_recording`` writes to a viewer that runs, as a recording of its own.
@@ -125,12 +130,14 @@ def send_recording(
         rollouts: See ``write_recording``.
         maps: See there.
         title: See there.
+        units: See there.
         robot: See there.
     """
     recording = rr.RecordingStream("gridnav", send_properties=False)
     recording.connect_grpc(address)
-    recording.send_blueprint(_side_by_side(layout, _same_course(rollouts)))
+    recording.send_blueprint(_side_by_side(layout, _same_course(rollouts), varied=_varies(rollouts)))
     _log_head(recording, title, None, _run_card(title, rollouts, None))
+    _log_drawn(recording, rollouts, units or {})
     _log_rollouts(recording, layout, rollouts, maps, robot)
     # What nobody takes is dropped: a viewer that was closed must not hold training up.
     with suppress(RuntimeError):
@@ -233,6 +240,25 @@ def _log_head(recording: rr.RecordingStream, title: str, properties: Mapping[str
         shown = {key: str(value) for key, value in properties.items()}
         recording.send_property("run", rr.AnyValues(drop_untyped_nones=True, **shown))
     recording.log("run_card", rr.TextDocument(card, media_type=rr.MediaType.MARKDOWN), static=True)
+
+
+def _varies(rollouts: Mapping[str, Episode]) -> bool:
+    return any(episode.randomization for episode in rollouts.values())
+
+
+def _log_drawn(recording: rr.RecordingStream, rollouts: Mapping[str, Episode], units: Mapping[str, str]) -> None:
+    """What was drawn for each rollout, as a table; nothing where nothing varied."""
+    if not _varies(rollouts):
+        return
+    drawn = {name: episode.randomization for name, episode in rollouts.items() if episode.randomization}
+    lines = [
+        f"| quantity | {' | '.join(_plain(name) for name in drawn)} | unit |",
+        f"| --- |{' ---: |' * len(drawn)} --- |",
+    ]
+    for quantity in dict.fromkeys(name for values in drawn.values() for name in values):
+        values = [f"{values[quantity]:.4g}" if quantity in values else "" for values in drawn.values()]
+        lines.append(f"| {_plain(quantity)} | {' | '.join(values)} | {_plain(units.get(quantity, ''))} |")
+    recording.log("drawn", rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN), static=True)
 
 
 # ---- The scene ---------------------------------------------------------------------------------
@@ -562,7 +588,7 @@ def _plain(text: str) -> str:
 # ---- The arrangement ---------------------------------------------------------------------------
 
 
-def _side_by_side(layout: Layout, traces: Mapping[str, Trace]) -> rrb.Blueprint:
+def _side_by_side(layout: Layout, traces: Mapping[str, Trace], *, varied: bool) -> rrb.Blueprint:
     """The mazes side by side, each with its curves below; on the right what they share."""
     mazes = [
         rrb.Spatial3DView(
@@ -600,8 +626,12 @@ def _side_by_side(layout: Layout, traces: Mapping[str, Trace]) -> rrb.Blueprint:
         _curve_view("Shortest way to the goal (m)", "/distance_to_goal", to_goal),
         rrb.StateTimelineView(name="What it does", origin="/state", time_view=_whole_episode()),
     ]
+    shares = [5, 5, 3]
+    if varied:
+        shared.insert(1, rrb.TextDocumentView(name="Drawn for this episode", origin="/drawn"))
+        shares.insert(1, 5)
     return _arranged(
-        rrb.Vertical(*rows, row_shares=[10, 6, 4]), rrb.Vertical(*shared, row_shares=[5, 5, 3]), max(len(traces), 2)
+        rrb.Vertical(*rows, row_shares=[10, 6, 4]), rrb.Vertical(*shared, row_shares=shares), max(len(traces), 2)
     )
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from gridnav.agents import Agent
 from gridnav.experiment.evaluation import evaluate, policy_for
 from gridnav.experiment.policy_maps import policy_maps
-from gridnav.experiment.worlds import Problem
+from gridnav.experiment.worlds import UNITS, Problem
 
 LIVE_SEED = 3_000_000
 """Seed of the episodes that are watched."""
@@ -64,5 +64,5 @@ class Spectator:
         maps = policy_maps(self._problem, agent, world, [episode.goal], observation=observation)
         title = f"{name} after {steps:,} steps"
         rollout, shown = {name: episode}, {name: maps[episode.goal]}
-        self._send_recording(self._address, self._problem.layout, rollout, maps=shown, title=title)
+        self._send_recording(self._address, self._problem.layout, rollout, maps=shown, title=title, units=UNITS)
         self._sent += 1

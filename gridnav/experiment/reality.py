@@ -1,15 +1,14 @@
 """Held-out worlds, for evaluation alone: each is wrong in a way that no training sees. All of them are simulations.
 
 Nothing that trains imports this file. ``parametric`` and ``structural`` are for development: anybody may look at what
-they do and why a policy fails in them. ``test`` is drawn from a sealed seed: it gives numbers and nothing else, and
-who asks is counted.
+they do and why a policy fails in them. ``test`` is drawn from a sealed seed: it gives numbers and nothing else.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any
 
@@ -27,6 +26,8 @@ from gridnav.problem.types import InputError
 SEAL = "0d942ead2e561c5b8637e9286583bf197bde84087c590c2b133338efdd79de24"
 """SHA-256 of the test reality's seed: it is the same one in every release, or this file says that it is not."""
 WORLD = "DiffDrive"
+PATCH_TOP_M, PATCH_MASK = 0.0005, 4
+"""Height of slippery places above the floor, and their contact mask beside those of ``burger.xml``."""
 STALL_V, STALL_N_M, NO_LOAD_RAD_S = 11.1, 1.4, 5.969
 """The motors of ``burger.xml``, which a motor with friction of another kind replaces."""
 
@@ -39,14 +40,14 @@ class Reality:
     """On the command line and in reports."""
     wrong: str
     """What differs, in words."""
-    randomization: Randomization
+    randomization: Randomization = field(repr=False)
     """What each episode draws."""
     edit_model: Callable[[mujoco.MjSpec], None] | None = None
     """How the model itself differs."""
     timestep_s: float = 0.025
     """Of the physics."""
     is_sealed: bool = False
-    """It gives metrics and no episodes, and every evaluation is logged."""
+    """It gives metrics and no episodes."""
 
     def episodes(
         self, problem: Problem, agent: Agent, n_episodes: int, *, on_progress: OnProgress | None = None
@@ -210,6 +211,7 @@ def _rebuild(seed: int, *, stiction_n_m: float, play_rad: float) -> Callable[[mu
     """
 
     def edit(spec: mujoco.MjSpec) -> None:
+        _add_patches(spec, np.random.default_rng(seed))
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
         for geom in spec.geoms:
@@ -233,19 +235,25 @@ def _rebuild(seed: int, *, stiction_n_m: float, play_rad: float) -> Callable[[mu
                 range=[-play_rad, play_rad], damping=0.001, armature=1e-4,
             )  # fmt: skip
         spec.geom("wheel_left").pos = [0.0005, 0.0, 0.0]  # out of true by half a millimetre
-        _add_patches(spec, np.random.default_rng(seed))
 
     return edit
 
 
 def _add_patches(spec: mujoco.MjSpec, rng: np.random.Generator) -> None:
-    """Slippery places on a fifth of the floor, flush with it."""
+    """Slippery places on a fifth of the floor.
+
+    They lie half a millimetre above it: flush with it, the floor would carry its share of a wheel and hold it. The
+    caster, which slips anyway, does not feel them.
+    """
+    for side in ("left", "right"):
+        spec.geom(f"wheel_{side}").contype |= PATCH_MASK
     width, height = 2.0 * np.asarray(spec.stat.center)[:2]
     for number in range(int(0.2 * width * height / 0.36)):
         # Place: uniform on the floor. Friction: uniform from wet to dusty.
         x, y = rng.uniform((0.0, 0.0), (width, height))
         spec.worldbody.add_geom(
-            name=f"patch_{number}", type=mujoco.mjtGeom.mjGEOM_BOX, pos=[x, y, -0.05], size=[0.3, 0.3, 0.05001],
-            contype=1, conaffinity=1, condim=3, friction=[float(rng.uniform(0.1, 0.3)), 0.005, 0.0001], priority=1,
+            name=f"patch_{number}", type=mujoco.mjtGeom.mjGEOM_BOX, pos=[x, y, PATCH_TOP_M - 0.05],
+            size=[0.3, 0.3, 0.05], contype=PATCH_MASK, conaffinity=PATCH_MASK, condim=3,
+            friction=[float(rng.uniform(0.1, 0.3)), 0.005, 0.0001], priority=1,
             rgba=[0.75, 0.85, 0.95, 1.0],
         )  # fmt: skip

@@ -18,7 +18,7 @@ from gridnav.experiment.pictures import pictures
 from gridnav.experiment.rollouts import Rollouts, save_rollouts
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory, read_json, write_json
 from gridnav.experiment.training import AgentKind, Budget, Choice, OnStage, Result, Workshop
-from gridnav.experiment.worlds import Problem
+from gridnav.experiment.worlds import UNITS, Problem
 from gridnav.problem.metrics import Episode
 from gridnav.problem.types import InputError
 
@@ -80,7 +80,7 @@ def write_rollouts(
     rollouts = {name: _here(problem, result)[number] for name, result in shown.items()}
     maps = {name: result.maps[rollouts[name].goal] for name, result in shown.items() if result.maps}
     title = f"gridnav {run.path.name}, episode {number}"
-    write_recording(run.recording, problem.layout, rollouts, maps=maps, title=title, properties=properties)
+    write_recording(run.recording, problem.layout, rollouts, maps=maps, title=title, properties=properties, units=UNITS)
 
 
 def kept(problem: Problem, result: Result) -> Rollouts:

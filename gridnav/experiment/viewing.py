@@ -11,6 +11,7 @@ import numpy as np
 from gridnav.display.recording import write_overlay, write_recording
 from gridnav.experiment.rollouts import Rollouts, load_rollouts, names
 from gridnav.experiment.run_directory import RunDirectory
+from gridnav.experiment.worlds import UNITS
 from gridnav.problem.types import Cell, InputError
 
 SIDE_BY_SIDE = 4
@@ -100,7 +101,7 @@ def record_episode(path: Path, found: dict[str, Rollouts], pick: Pick) -> None:
     rollouts = {label: one.episodes[number] for label, one in found.items()}
     goal = first.episodes[number].goal
     maps = {label: one.maps[goal] for label, one in found.items() if goal in one.maps}
-    write_recording(path, layout, rollouts, maps=maps, title=f"Episode {number}")
+    write_recording(path, layout, rollouts, maps=maps, title=f"Episode {number}", units=UNITS)
 
 
 def _ends(rollouts: Rollouts, number: int) -> tuple[Cell, Cell]:

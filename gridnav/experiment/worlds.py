@@ -14,6 +14,8 @@ from gridnav.problem.reward import Reward
 from gridnav.problem.task import Task
 
 NOTHING_VARIES = Randomization()
+UNITS = {name: "" if one.unit == "1" else one.unit for name, one in PARAMETERS.items()}
+"""Of what a randomization draws, by quantity."""
 RANDOM = "random"
 """Name of the family of random layouts, where a layout's name is asked for."""
 

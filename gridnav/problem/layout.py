@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -226,22 +227,30 @@ class Layout:
             stack.append((r, c))
         return cls(walls, ~walls, ~walls, cell_size_m, f"maze-{n_rows}x{n_cols}-{seed}")
 
-    def with_moved_walls(self, n: int, rng: np.random.Generator) -> Layout:
+    def with_moved_walls(self, n: int, rng: np.random.Generator, *, kept: Sequence[Cell] = ()) -> Layout:
         """A layout in which up to ``n`` wall cells stand elsewhere and the free cells still hang together.
 
         Starts and goals stay where they are; where every free cell was one, every free cell is one.
+
+        Args:
+            n: How many walls.
+            rng: Chooses them and where they go.
+            kept: Reachable cells beside starts and goals that stay free and reachable.
         """
         walls = self.walls.copy()
         any_start, any_goal = (bool((mask == ~walls).all()) for mask in (self.starts, self.goals))
-        kept = (self.starts & (not any_start)) | (self.goals & (not any_goal))
+        stays = (self.starts & (not any_start)) | (self.goals & (not any_goal))
+        for cell in kept:
+            stays[cell] = True
         n_regions = ndimage.label(~walls)[1]
         for _ in range(n):
             # From and to: uniform over walls, and over free cells that are neither start nor goal.
-            sources, targets = (rng.permutation(np.argwhere(cells)) for cells in (walls, ~walls & ~kept))
+            sources, targets = (rng.permutation(np.argwhere(cells)) for cells in (walls, ~walls & ~stays))
             for source, target in zip(sources, targets, strict=False):
                 moved = walls.copy()
                 moved[tuple(source)], moved[tuple(target)] = False, True
-                if ndimage.label(~moved)[1] <= n_regions:
+                regions, n_now = ndimage.label(~moved)
+                if n_now <= n_regions and len(np.unique(regions[stays])) <= 1:
                     walls = moved
                     break
         starts, goals = (~walls if any_start else self.starts), (~walls if any_goal else self.goals)
