@@ -267,9 +267,9 @@ class Sweep:
         """Run it."""
         from gridnav.experiment.sweep import TABLE, carry_out, check_backend
 
-        jobs = self.jobs or cpu_count()
+        jobs = cpu_count() if self.jobs is None else self.jobs
         if not 1 <= jobs <= 1024:
-            raise InputError(f"--jobs {self.jobs} is outside 1 to 1024")
+            raise InputError(f"--jobs {jobs} is outside 1 to 1024")
         check_backend(self.backend)
         trials, config = self._plan()
         with _directory(self.run_dir, self.resume, "sweep", config) as run, _trials_bar(len(trials)) as on_done:
@@ -707,7 +707,7 @@ def _apart(words: list[str]) -> tuple[list[str], list[str]]:
     common: list[str] = []
     into = own
     for word in words:
-        if word.startswith("-"):
+        if word.startswith("--") or word == "-h":
             into = own if word.partition("=")[0].replace("_", "-").replace("--no-", "--") in names else common
         into.append(word)
     return own, common
@@ -724,9 +724,9 @@ def _with_settings(shared: Mapping[str, Any], settings: Mapping[str, str], comma
         elif field in known - {"set"}:
             config[field] = words
         else:
-            names = sorted(known - {"set"}) + ["set.NAME"] * ("set" in known)
-            near = get_close_matches(field, names, 1) or names
-            raise InputError(f"{command} has no field {field!r:.60}: did you mean {near[0]}?")
+            near = get_close_matches(group, known, 1, cutoff=0.3)[:1] or sorted(known)
+            meant = "set.NAME" if near[0] == "set" else near[0]
+            raise InputError(f"{command} has no field {field!r:.60}: did you mean {meant}?")
     return config
 
 
