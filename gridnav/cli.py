@@ -238,6 +238,15 @@ OF_ONE_START: dict[str, Any] = {
 class Sweep:
     """Do many trials and put them into one table; flags of train or ladder say what all trials have in common."""
 
+    study: Literal["", "arms", "presets", "default", "leave-one-out", "one-at-a-time", "strength"] = ""
+    """A ready-made sweep with a report: what transfer saves, PPO under each randomization, both (default), which part
+    of a randomization training needs; or, of finished --runs, success against each quantity or all together."""
+    seeds: int | None = None
+    """Trainings of each kind of a study, with the seeds 0, 1, ...: 3 by default, 10 with --budget full."""
+    runs: tuple[Path, ...] = ()
+    """Finished runs that one-at-a-time and strength evaluate, which also take --randomization and --episodes."""
+    quantities: tuple[str, ...] = ()
+    """Of the randomization, for leave-one-out, one-at-a-time and strength; or drive, physics, command, sense."""
     grid: tuple[str, ...] = ()
     """Fields with the values to combine, such as seed=0,1,2 set.learning_rate=0.001,0.003 layout=classic,u-trap."""
     random: tuple[str, ...] = ()
@@ -267,17 +276,25 @@ class Sweep:
         """Run it."""
         from gridnav.experiment.sweep import TABLE, carry_out, check_backend
 
-        jobs = self.jobs or cpu_count()
+        jobs = cpu_count() if self.jobs is None else self.jobs
         if not 1 <= jobs <= 1024:
-            raise InputError(f"--jobs {self.jobs} is outside 1 to 1024")
+            raise InputError(f"--jobs {jobs} is outside 1 to 1024")
         check_backend(self.backend)
-        trials, config = self._plan()
-        with _directory(self.run_dir, self.resume, "sweep", config) as run, _trials_bar(len(trials)) as on_done:
+        trials, config = self._study() if self.study else self._plan()
+        with (
+            _directory(self.run_dir, self.resume, self.study or "sweep", config) as run,
+            _trials_bar(len(trials)) as bar,
+        ):
             outcomes = carry_out(
-                trials, run, jobs=jobs, backend=self.backend, checkpoint_s=self.checkpoint_s, on_done=on_done
+                trials, run, jobs=jobs, backend=self.backend, checkpoint_s=self.checkpoint_s, on_done=bar
             )
         _show_sweep(trials, outcomes)
         stdout.print(f"table      {run.path / TABLE}")
+        if self.study:
+            from gridnav.experiment.findings import write_study
+
+            sentence = write_study(self.study, trials, outcomes, run, command=_again(run), config=config)
+            stdout.print(f"report     {run.report}\n{sentence}", markup=False)
         return 0
 
     def _plan(self) -> tuple[list[Trial], dict[str, Any]]:
@@ -286,25 +303,81 @@ class Sweep:
         from gridnav.experiment.sweep import Trial
 
         if not self.grid and not self.random:
-            raise InputError("a sweep needs something to vary: --grid seed=0,1,2 or --random FIELD=LAW")
+            raise InputError("a sweep needs something to vary: --grid seed=0,1,2, --random FIELD=LAW or --study NAME")
+        self._leave_out("seeds", "runs", "quantities", because="is for a --study")
         if not 0 <= self.design_seed < 2**32:
             raise InputError(f"--design-seed {self.design_seed} is outside 0 to 4294967295")
-        command = COMMANDS[self.trial]
-        common = _parse(command, self.trial, list(self.common))
+        shared = self._shared(self.trial)
+        settings = settings_of(self.grid, self.random, n_draws=self.n_trials, seed=self.design_seed)
+        trials = [
+            Trial(number, one, _checked(self.trial, _with_settings(shared, one, self.trial)))
+            for number, one in enumerate(settings)
+        ]
+        return trials, self._config(shared)
+
+    def _study(self) -> tuple[list[Trial], dict[str, Any]]:
+        """The same of a study."""
+        from gridnav.experiment.studies import EVALUATING, Wish, plan
+        from gridnav.experiment.sweep import Trial
+
+        self._leave_out("grid", "random", "n_trials", "design_seed", "trial", because="goes without --study")
+        evaluates = self.study in EVALUATING
+        if evaluates:
+            self._leave_out("seeds", because="is for studies that train")
+            finished = _parse(_Finished, f"sweep --study {self.study}", list(self.common))
+            if not 1 <= finished.episodes <= 100_000:
+                raise InputError(f"--episodes {finished.episodes} is outside 1 to 100000")
+            shared = json.loads(json.dumps(asdict(finished)))
+            wish = Wish((), finished.randomization, self.quantities, self.runs, finished.episodes)
+        else:
+            self._leave_out("runs", because="is for the studies one-at-a-time and strength")
+            shared = self._shared("ladder" if self.study in ("arms", "default") else "train")
+            seeds = (10 if shared["budget"] == "full" else 3) if self.seeds is None else self.seeds
+            if not 1 <= seeds <= 1000:
+                raise InputError(f"--seeds {seeds} is outside 1 to 1000")
+            wish = Wish(range(seeds), shared.get("randomization", ""), self.quantities)
+        trials = []
+        for number, draft in enumerate(plan(self.study, wish)):
+            config = draft.fields
+            if not evaluates:
+                names = {field.name for field in fields(COMMANDS[draft.command])}  # type: ignore[arg-type]
+                own = {key: value for key, value in shared.items() if key in names}
+                config = _checked(draft.command, {**own, **draft.fields})
+            trials.append(Trial(number, draft.settings, config, draft.under))
+        return trials, self._config(shared)
+
+    def _shared(self, command: str) -> dict[str, Any]:
+        """What all trials of a command have in common, as its configuration."""
+        common = _parse(COMMANDS[command], command, list(self.common))
         alone = [key for key, default in OF_ONE_START.items() if getattr(common, key) != default]
         if alone:
             raise InputError(f"--{alone[0].replace('_', '-')} is for one run: leave it out of the sweep")
-        _, shared = common._problem()
-        settings = settings_of(self.grid, self.random, n_draws=self.n_trials, seed=self.design_seed)
-        trials = []
-        for number, one in enumerate(settings):
-            words = _words(_with_settings(shared, one, self.trial), "the sweep")
-            trials.append(Trial(number, one, _parse(command, self.trial, words).checked()[1]))
-        own = {key: value for key, value in asdict(self).items() if key in OF_A_SWEEP}
-        return trials, json.loads(json.dumps(shared | {"command": "sweep", **own}))
+        config: dict[str, Any] = common._problem()[1]
+        return {key: value for key, value in config.items() if key != "command"}
+
+    def _config(self, shared: Mapping[str, Any]) -> dict[str, Any]:
+        own = {name: value for name in OF_A_SWEEP if (value := getattr(self, name)) != getattr(Sweep, name)}
+        if self.runs:
+            own["runs"] = [str(path.resolve()) for path in self.runs]
+        return json.loads(json.dumps({"command": "sweep", **shared, **own}))
+
+    def _leave_out(self, *names: str, because: str) -> None:
+        for name in names:
+            if getattr(self, name) != getattr(Sweep, name):
+                raise InputError(f"--{name.replace('_', '-')} {because}: leave it out")
 
 
-OF_A_SWEEP = ("trial", "grid", "random", "n_trials", "design_seed")
+@dataclass(frozen=True)
+class _Finished:
+    """Flags of studies of finished runs."""
+
+    randomization: str = ""
+    """What varies: a preset, a JSON file or JSON text; by default what varied in training, or else burger."""
+    episodes: int = 200
+    """Of each evaluation."""
+
+
+OF_A_SWEEP = ("study", "seeds", "runs", "quantities", "trial", "grid", "random", "n_trials", "design_seed")
 """Flags of a sweep that are part of its configuration, beside those that its trials have in common."""
 
 
@@ -743,16 +816,22 @@ def _apart(words: list[str]) -> tuple[list[str], list[str]]:
     common: list[str] = []
     into = own
     for word in words:
-        if word.startswith("-"):
+        if word.startswith("--") or word == "-h":
             into = own if word.partition("=")[0].replace("_", "-").replace("--no-", "--") in names else common
         into.append(word)
     return own, common
 
 
+def _checked(command: str, config: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration of a trial as its command writes it down, once all in it is known to be right."""
+    own: dict[str, Any] = _parse(COMMANDS[command], command, _words(config, "the sweep")).checked()[1]
+    return own
+
+
 def _with_settings(shared: Mapping[str, Any], settings: Mapping[str, str], command: str) -> dict[str, Any]:
     """What trials have in common, with one trial's settings; ``set.NAME`` is a hyper-parameter."""
     known = {field.name for field in fields(COMMANDS[command])} - OF_ONE_START.keys()  # type: ignore[arg-type]
-    config = {key: value for key, value in shared.items() if key != "command"}
+    config = dict(shared)
     for field, words in settings.items():
         group, dot, name = field.partition(".")
         if dot and group == "set" and group in known:
@@ -760,9 +839,9 @@ def _with_settings(shared: Mapping[str, Any], settings: Mapping[str, str], comma
         elif field in known - {"set"}:
             config[field] = words
         else:
-            names = sorted(known - {"set"}) + ["set.NAME"] * ("set" in known)
-            near = get_close_matches(field, names, 1) or names
-            raise InputError(f"{command} has no field {field!r:.60}: did you mean {near[0]}?")
+            near = get_close_matches(group, known, 1, cutoff=0.3)[:1] or sorted(known)
+            meant = "set.NAME" if near[0] == "set" else near[0]
+            raise InputError(f"{command} has no field {field!r:.60}: did you mean {meant}?")
     return config
 
 

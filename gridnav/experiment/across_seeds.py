@@ -91,14 +91,18 @@ def _labelled(
     runs: Sequence[tuple[RunDirectory, Sequence[Result]]],
 ) -> list[tuple[str, RunDirectory, Result]]:
     """Every result with its agent's name and the flags in which its run differs from others."""
-    configs = [{key: value for key, value in run.read_config().items() if key not in OWN_TO_A_SEED} for run, _ in runs]
-    keys = dict.fromkeys(key for config in configs for key in config)
-    differ = [key for key in keys if len({json.dumps(config.get(key)) for config in configs}) > 1 and key != "agent"]
     labelled = []
-    for (run, results), config in zip(runs, configs, strict=True):
-        words = " ".join(_words(config.get(key)) for key in differ if config.get(key))
+    for (run, results), words in zip(runs, labels_of([run.read_config() for run, _ in runs]), strict=True):
         labelled += [(f"{result.name} {words}".strip(), run, result) for result in results]
     return labelled
+
+
+def labels_of(configs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What tells the configurations of runs from each other, in words, whatever their seeds; empty where nothing."""
+    own = [{key: value for key, value in config.items() if key not in OWN_TO_A_SEED} for config in configs]
+    keys = dict.fromkeys(key for config in own for key in config)
+    differ = [key for key in keys if len({json.dumps(config.get(key)) for config in own}) > 1 and key != "agent"]
+    return [" ".join(_words(config.get(key)) for key in differ if config.get(key)) for config in own]
 
 
 def _words(value: Any) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -74,11 +73,22 @@ def _field(text: str) -> str:
 
 def _axis(text: str) -> tuple[str, list[str]]:
     field, words = _field_and_words(text)
-    # Commas inside brackets belong to a value: hidden=[64,64],[128,128] are two.
-    values = re.split(r",(?![^\[{]*[\]}])", words)
+    values = _split(words)
     if "" in values or len(set(values)) < len(values):
         raise InputError(f"{text!r:.60} has an empty value, or one twice")
     return field, values
+
+
+def _split(words: str) -> list[str]:
+    """Values with commas between; those inside brackets belong to a value: ``[64,64],[128]`` are two."""
+    values, depth = [""], 0
+    for letter in words:
+        depth += (letter in "[{") - (letter in "]}")
+        if letter == "," and depth == 0:
+            values.append("")
+        else:
+            values[-1] += letter
+    return values
 
 
 def _law(field: str, words: str) -> Draw:

@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
@@ -36,7 +36,9 @@ class Trial:
     settings: Mapping[str, str]
     """What tells it from the others, by column of the table."""
     config: Mapping[str, Any]
-    """All that it does."""
+    """What it does, as the command that does it alone would write it down."""
+    under: Mapping[str, str] = field(default_factory=dict)
+    """Randomizations that its agents are evaluated under, by name; by default the one they were trained in."""
 
     def folder(self, sweep: RunDirectory) -> Path:
         """Where its files are."""
@@ -134,7 +136,7 @@ def _attempt(one: Trial, folder: Path, checkpoint_s: float, sweeper: int | None)
         _end_with(sweeper)
     began = time.perf_counter()
     try:
-        rows, error = trial(one.config, folder, checkpoint_s), ""
+        rows, error = trial(one.config, folder, checkpoint_s, one.under), ""
     except OSError:
         raise
     except Exception as failure:  # one bad trial must not take the others down

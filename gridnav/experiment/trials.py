@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Self
 
 from gridnav.experiment.checkpoint import clear_leftovers
@@ -27,6 +28,7 @@ Row = dict[str, Any]
 """An evaluated agent: names and numbers, fit for JSON."""
 DIGITS = 6
 """Behind the point, of the numbers in rows."""
+NOWHERE_ELSE: Mapping[str, str] = MappingProxyType({})
 PATIENCE_S = 30.0
 """How long a trial waits for a process that still works on it, whose sweep was killed."""
 
@@ -76,7 +78,7 @@ def problem_of(config: Mapping[str, Any]) -> Problem:
     Raises:
         InputError: When a part of it is unknown or wrong.
     """
-    return Problem.load(config["layout"], config["task"], config["reward"])
+    return Problem.load(config["layout"], config["task"], config["reward"], config.get("randomization", "none"))
 
 
 def _changes(pairs: Sequence[str]) -> dict[str, str]:
@@ -90,18 +92,26 @@ def _changes(pairs: Sequence[str]) -> dict[str, str]:
     return changes
 
 
-def trial(config: Mapping[str, Any], path: Path, checkpoint_s: float = CHECKPOINT_S) -> list[Row]:
+def trial(
+    config: Mapping[str, Any],
+    path: Path,
+    checkpoint_s: float = CHECKPOINT_S,
+    under: Mapping[str, str] = NOWHERE_ELSE,
+) -> list[Row]:
     """Do what a configuration asks for; the same configuration gives the same rows.
 
     A trial that was killed goes on from its checkpoints, and gives the rows that it would have given.
 
     Args:
-        config: As in the ``config.json`` of a run, with the command under ``command``: ``train`` or ``ladder``.
+        config: As in the ``config.json`` of a run, with the command under ``command``: ``train``, ``ladder`` or
+            ``evaluate``.
         path: The trial's run directory, which is made if it does not exist.
         checkpoint_s: Seconds between two checkpoints of a training.
+        under: Where agents that were trained are evaluated: randomizations by the name that their rows bear. By
+            default where they were trained.
 
     Returns:
-        One row per evaluated agent.
+        One row per evaluation of an agent.
 
     Raises:
         InputError: When the configuration is not possible, or the directory belongs to another one.
@@ -110,7 +120,10 @@ def trial(config: Mapping[str, Any], path: Path, checkpoint_s: float = CHECKPOIN
     """
     with _directory(path, config) as run:
         results = TRIALS[config["command"]](config, run, checkpoint_s)
-    return [row_of(result) for result in results]
+        if not under:
+            return [row_of(result) for result in results]
+        n_episodes = BUDGETS[config["budget"]].episodes
+        return [{"under": name} | row_of(one) for name, what in under.items() for one in _again(run, n_episodes, what)]
 
 
 @contextmanager
@@ -122,7 +135,6 @@ def _directory(path: Path, config: Mapping[str, Any]) -> Iterator[RunDirectory]:
         check_config(run, config)
         if not run.config.is_file():
             write_json(run.config, config)
-        run.figures.mkdir(exist_ok=True)
         clear_leftovers(run.checkpoints)
         yield run
 
@@ -148,15 +160,33 @@ def _train(config: Mapping[str, Any], run: RunDirectory, checkpoint_s: float) ->
 
 
 def _ladder(config: Mapping[str, Any], run: RunDirectory, checkpoint_s: float) -> list[Result]:
-    from gridnav.experiment.ladder import climb
+    from gridnav.experiment.arms import choose_arms
+    from gridnav.experiment.ladder import climb, compare
 
-    budget = BUDGETS[config["budget"]]
-    return climb(problem_of(config), budget, config["seed"], run, "", config, _unseen, checkpoint_s=checkpoint_s)
+    run.figures.mkdir(exist_ok=True)
+    problem, budget, seed = problem_of(config), BUDGETS[config["budget"]], config["seed"]
+    how: dict[str, Any] = {"checkpoint_s": checkpoint_s}
+    if "arms" in config:
+        return compare(problem, budget, seed, choose_arms(config["arms"]), run, "", config, _unseen, **how)
+    return climb(problem, budget, seed, run, "", config, _unseen, **how)
+
+
+def _evaluate(config: Mapping[str, Any], run: RunDirectory, checkpoint_s: float) -> list[Result]:
+    return _again(RunDirectory.open(Path(config["run"])), config["episodes"], config["randomization"])
+
+
+def _again(run: RunDirectory, n_episodes: int, randomization: str) -> list[Result]:
+    """The robots of a finished run, evaluated anew; nothing varies on the grid."""
+    from gridnav.experiment.results import evaluate_again
+
+    results = evaluate_again(run, n_episodes, None, _unseen, randomization=randomization)
+    return [result for result in results if result.world != "GridWorld"]
 
 
 TRIALS: dict[str, Callable[[Mapping[str, Any], RunDirectory, float], list[Result]]] = {
     "train": _train,
     "ladder": _ladder,
+    "evaluate": _evaluate,
 }
 """What a trial can do, by the name of the command that does it alone."""
 

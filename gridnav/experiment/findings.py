@@ -1,0 +1,301 @@
+"""What ready-made sweeps found: a sentence, tables and figures, on a page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gridnav.display.curves import success_bars
+from gridnav.display.report import Picture, Report, Table, write_report
+from gridnav.display.responses import Panel, Response, responses
+from gridnav.display.style import save_figure
+from gridnav.envs import PARAMETERS, Randomization
+from gridnav.experiment.across_seeds import labels_of
+from gridnav.experiment.run_directory import RunDirectory
+from gridnav.experiment.studies import EVERYTHING, NOTHING, PARTS, UNDER
+from gridnav.experiment.sweep import Outcome, Trial
+from gridnav.experiment.transfer import transfer_report, write_transfer
+from gridnav.experiment.trials import Row
+from gridnav.problem.statistics import iqm, stratified_bootstrap
+from gridnav.problem.types import InputError
+
+OVER_SEEDS = (
+    "Interquartile means over seeds, of fewer than four the mean, with 95 % bootstrap intervals over them; with one "
+    "seed the interval is Wilson's."
+)
+QUESTIONS = {
+    "arms": "What does a robot save that begins with what was learnt on an easier rung?",
+    "presets": "Does training in a world that varies help where it varies?",
+    "leave-one-out": "Which part of the randomization does training need?",
+    "one-at-a-time": "Which quantity of the robot may leave its nominal value, and how far?",
+    "strength": "How much may everything vary together?",
+}
+
+
+@dataclass(frozen=True)
+class Done:
+    """A trial and what came of it."""
+
+    trial: Trial
+    outcome: Outcome
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What a study says."""
+
+    sentence: str
+    """The answer, with numbers."""
+    tables: Sequence[Table]
+    pictures: Mapping[str, Picture]
+    """By the name of the file."""
+
+
+# ---- Studies that train ---------------------------------------------------------------------------------
+
+
+def _find_arms(done: Sequence[Done], sweep: RunDirectory) -> Findings:
+    runs = [RunDirectory.open(one.trial.folder(sweep)) for one in done if not one.outcome.error]
+    report = transfer_report(runs)
+    write_transfer(sweep.figures, report)
+    return Findings(report.sentence, [report.table], {"transfer": report.picture})
+
+
+def _find_presets(done: Sequence[Done], sweep: RunDirectory) -> Findings:
+    cells = _cells(done, "randomization")
+    presets = list(dict.fromkeys(preset for preset, _ in cells))
+    best = max(presets, key=lambda preset: np.mean([cells[preset, under].success[0] for under in UNDER]))
+    told = ", ".join(f"{_interval(cells[best, under].success)} under {under}" for under in UNDER)
+    sentence = f"PPO trained under {best} is best on average over {', '.join(UNDER)}: {told}"
+    if best != "none" and "none" in presets:
+        told = ", ".join(f"{_interval(cells['none', under].success)} under {under}" for under in UNDER)
+        sentence += f"; trained without randomization it reaches {told}"
+    bars = {f"{preset}, tested under {under}": cells[preset, under].success for under in UNDER for preset in presets}
+    caption = "Success of PPO trained under each preset, tested where nothing varies, under burger and under wide."
+    table = _matrix("Trained under, tested under", "trained under", cells, presets, list(UNDER))
+    return Findings(sentence + ".", [table], {"presets": Picture(success_bars(bars, target=None), caption)})
+
+
+def _find_leave_one_out(done: Sequence[Done], sweep: RunDirectory) -> Findings:
+    cells = _cells(done, "without")
+    names = list(dict.fromkeys(name for name, _ in cells))
+    parts = [name for name in names if name not in (NOTHING, EVERYTHING)]
+    worst = min(parts, key=lambda name: cells[name, "whole"].success[0])
+    reached = {name: _interval(cells[name, "whole"].success) for name in names}
+    sentence = (
+        f"Under the whole randomization, PPO that was trained in it reaches {reached[NOTHING]}; what it misses most is "
+        f"{worst}: trained without, it reaches {reached[worst]}, and without everything {reached[EVERYTHING]}."
+    )
+    bars = {f"without {name}": cells[name, "whole"].success for name in names}
+    picture = Picture(
+        success_bars(bars, target=None), "Success under the whole randomization, by what training lacked."
+    )
+    table = _matrix("What training lacked", "trained without", cells, names, ["whole", "none"])
+    return Findings(sentence, [table], {"leave-one-out": picture})
+
+
+# ---- Studies of finished runs ---------------------------------------------------------------------------
+
+
+def _find_one_at_a_time(done: Sequence[Done], sweep: RunDirectory) -> Findings:
+    lines = _lines(done, "quantity", "value")
+    quantities = list(dict.fromkeys(one.trial.settings["quantity"] for one in done))
+    trained = _trained(done)
+    panels, rows, falls = [], [], {}
+    for name in quantities:
+        unit, nominal = PARAMETERS[name].unit, PARAMETERS[name].nominal
+        here = {label: line for (label, quantity), line in lines.items() if quantity == name}
+        ends = trained[name] if trained else None
+        panels.append(Panel(f"{name} ({unit})", here, ends))
+        for label, line in here.items():
+            at_nominal = line.y[int(np.argmin(np.abs(np.array(line.x) - nominal)))]
+            worst = int(np.argmin(line.y))
+            falls[name, label] = at_nominal - line.y[worst]
+            range_words = "-" if ends is None else _ends(*ends)
+            low, high = line.x[0], line.x[-1]
+            rows.append(
+                [name, label, unit, range_words, _ends(low, high), _percent(at_nominal), _percent(line.y[worst]),
+                 f"{line.x[worst]:g}"]
+            )  # fmt: skip
+    name, label = max(falls, key=lambda key: falls[key])
+    sentence = (
+        f"Of {len(quantities)} quantities, varied one at a time, {name} costs {label} most: its success falls by "
+        f"{100 * falls[name, label]:.1f} points; {sum(fall < 0.05 for fall in falls.values())} of {len(falls)} curves "
+        "stay within five points of the nominal robot's."
+    )
+    columns = ("quantity", "agent", "unit", "in training", "tested", "success at nominal", "worst success", "at")
+    table = Table("One at a time", columns, rows, OVER_SEEDS)
+    return Findings(
+        sentence,
+        [table],
+        {"one-at-a-time": Picture(responses(panels), f"Success against one quantity at a time. {OVER_SEEDS}")},
+    )
+
+
+def _find_strength(done: Sequence[Done], sweep: RunDirectory) -> Findings:
+    lines = {label: line for (label, _), line in _lines(done, "", "strength").items()}
+    area = {label: float(np.trapezoid(line.y, line.x) / (line.x[-1] - line.x[0])) for label, line in lines.items()}
+    best = max(area, key=lambda label: area[label])
+    at = {label: [line.y[line.x.index(k)] for k in (0.0, 1.0, 2.0)] for label, line in lines.items()}
+    told = [f"{label} {', '.join(map(_percent, at[label]))}" for label in lines]
+    sentence = (
+        f"Success at strength 0, 1 and 2: {'; '.join(told)}. On average over strengths {best} reaches "
+        f"{_percent(area[best])}."
+    )
+    rows = [[label, *map(_percent, at[label]), _percent(area[label])] for label in lines]
+    columns = ("agent", "strength 0", "strength 1", "strength 2", "mean over strengths")
+    table = Table("Robustness", columns, rows, "The mean is the area under the curve over its width. " + OVER_SEEDS)
+    figure = responses([Panel("strength of the randomization (1: as given, 0: nothing varies)", lines)])
+    return Findings(
+        sentence, [table], {"strength": Picture(figure, f"Success as all ranges are widened together. {OVER_SEEDS}")}
+    )
+
+
+def _lines(done: Sequence[Done], group: str, x: str) -> dict[tuple[str, str], Response]:
+    """Success against a setting, by agent and group; seeds of one training are one line."""
+    paths = list(dict.fromkeys(one.trial.config["run"] for one in done))
+    labels = dict(zip(paths, labels_of([RunDirectory.open(Path(path)).read_config() for path in paths]), strict=True))
+    points: dict[tuple[str, str], dict[float, list[Row]]] = {}
+    for one in done:
+        for row in one.outcome.rows:
+            key = f"{row['name']} {labels[one.trial.config['run']]}".strip(), one.trial.settings.get(group, "")
+            points.setdefault(key, {}).setdefault(float(one.trial.settings[x]), []).append(row)
+    lines = {}
+    for key, by_value in points.items():
+        values = sorted(by_value)
+        triples = [_over_seeds(by_value[value], "success") for value in values]
+        lines[key] = Response(values, *(list(part) for part in zip(*triples, strict=True)))
+    if not lines:
+        raise InputError("no trial of the study gave a result: see the errors in its table")
+    return lines
+
+
+def _trained(done: Sequence[Done]) -> dict[str, tuple[float, float]]:
+    """The ranges of training, where all runs had the same."""
+    paths = list(dict.fromkeys(one.trial.config["run"] for one in done))
+    varied = {RunDirectory.open(Path(path)).read_config().get("randomization", "none") for path in paths}
+    if len(varied) > 1:
+        return {}
+    ranges = Randomization.load(varied.pop())
+    return {name: (getattr(ranges, name).low, getattr(ranges, name).high) for name in PARAMETERS}
+
+
+# ---- What they share --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Cell:
+    """One kind of training in one kind of test, over seeds: middle and interval."""
+
+    success: tuple[float, float, float]
+    spl: tuple[float, float, float]
+    collided: tuple[float, float, float]
+    n_seeds: int
+
+
+def _cells(done: Sequence[Done], column: str) -> dict[tuple[str, str], _Cell]:
+    """By the setting of a column and where it was tested."""
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for one in done:
+        for row in one.outcome.rows:
+            groups.setdefault((one.trial.settings[column], row["under"]), []).append(row)
+    wanted = {one.trial.settings[column] for one in done}
+    missing = wanted - {name for name, _ in groups}
+    if missing:
+        raise InputError(f"every trial of {sorted(missing)[0]} failed: see the errors in the table")
+    return {
+        key: _Cell(_over_seeds(rows, "success"), _over_seeds(rows, "spl"), _over_seeds(rows, "collided"), len(rows))
+        for key, rows in groups.items()
+    }
+
+
+def _over_seeds(rows: Sequence[Row], name: str) -> tuple[float, float, float]:
+    """Middle and 95 % interval of a number over seeds; the episodes' own interval where there is one seed."""
+    scores = [float(row[name]) for row in rows]
+    if len(scores) == 1:
+        return scores[0], float(rows[0].get(f"{name}_low", scores[0])), float(rows[0].get(f"{name}_high", scores[0]))
+    return float(iqm(scores)), *stratified_bootstrap([scores], rng=np.random.default_rng(0))
+
+
+def _matrix(
+    title: str, first: str, cells: Mapping[tuple[str, str], _Cell], names: Iterable[str], tests: Sequence[str]
+) -> Table:
+    """One row per training, one column of success per test; SPL and collisions in the first test."""
+    successes = [f"success under {test}" for test in tests]
+    columns = (first, *successes, f"SPL under {tests[0]}", "episodes with a collision", "seeds")
+    rows = []
+    for name in names:
+        here = cells[name, tests[0]]
+        successes = [_interval(cells[name, test].success) for test in tests]
+        rows.append([name, *successes, f"{here.spl[0]:.2f}", _percent(here.collided[0]), str(here.n_seeds)])
+    return Table(title, columns, rows, f"SPL and collisions are those under {tests[0]}. {OVER_SEEDS}")
+
+
+def _interval(triple: tuple[float, float, float]) -> str:
+    value, low, high = triple
+    return f"{100 * value:.1f} %" + ("" if low == high else f" ({100 * low:.1f} to {100 * high:.1f} %)")
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %"
+
+
+def _ends(low: float, high: float) -> str:
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
+
+
+FINDERS: dict[str, Callable[[Sequence[Done], RunDirectory], Findings]] = {
+    "arms": _find_arms,
+    "presets": _find_presets,
+    "leave-one-out": _find_leave_one_out,
+    "one-at-a-time": _find_one_at_a_time,
+    "strength": _find_strength,
+}
+
+
+def write_study(
+    name: str,
+    trials: Sequence[Trial],
+    outcomes: Sequence[Outcome],
+    sweep: RunDirectory,
+    *,
+    command: str,
+    config: Mapping[str, Any],
+) -> str:
+    """``report.html`` and the figures of a finished study.
+
+    Args:
+        name: One of ``PARTS``.
+        trials: All of them.
+        outcomes: What came of them.
+        sweep: Where the files go.
+        command: What makes the study again.
+        config: Its configuration.
+
+    Returns:
+        The answer, in a sentence or two.
+
+    Raises:
+        InputError: When so many trials failed that there is no answer.
+    """
+    done = [Done(trial, outcome) for trial, outcome in zip(trials, outcomes, strict=True)]
+    found = []
+    for part in PARTS[name]:
+        own = [one for one in done if one.trial.settings.get("study", part) == part]
+        found.append(FINDERS[part](own, sweep))
+    pictures = {name: picture for one in found for name, picture in one.pictures.items()}
+    for file, picture in pictures.items():
+        for ending in (".png", ".svg"):
+            save_figure(picture.figure, sweep.figures / f"{file}{ending}")
+    failed = sum(bool(outcome.error) for outcome in outcomes)
+    sentence = " ".join(one.sentence for one in found) + (f" {failed} of {len(done)} trials failed." if failed else "")
+    page = Report(
+        f"Study: {name}", " ".join(QUESTIONS[part] for part in PARTS[name]), sentence, (), [*pictures.values()],
+        config, command, recording="", tables=[table for one in found for table in one.tables],
+    )  # fmt: skip
+    write_report(sweep.report, page)
+    return sentence

@@ -1,0 +1,213 @@
+"""Ready-made sweeps: which trials each of them does."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gridnav.envs import PARAMETERS, RANDOMIZATION_PRESETS, Randomization
+from gridnav.experiment.arms import ARMS
+from gridnav.experiment.design import Settings
+from gridnav.experiment.run_directory import RunDirectory
+from gridnav.problem.types import InputError
+
+RANDOMIZED = "burger"
+"""The randomization of studies that are not told another one."""
+UNDER = {"none": "none", "burger": "burger", "wide": "wide"}
+"""Where agents of the presets are evaluated."""
+STRENGTHS = tuple(k / 4 for k in range(9))
+REACHES = (0.5, 1.0, 1.5, 2.0)
+"""How far a quantity goes from its nominal value, as a share of the way to either end of its range."""
+GROUPS = {
+    group: tuple(name for name, parameter in PARAMETERS.items() if parameter.acts_on == group)
+    for group in ("drive", "physics", "command", "sense")
+}
+"""Quantities that are left out together."""
+NOTHING, EVERYTHING = "nothing", "everything"
+"""Names of what is left out where nothing is, and where nothing is left."""
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What a study is asked for, as far as it asks."""
+
+    seeds: Sequence[int] = (0, 1, 2)
+    """Of the trainings."""
+    randomization: str = ""
+    """A preset, a JSON file or JSON text; the runs' own or ``burger`` by default."""
+    quantities: Sequence[str] = ()
+    """Of that randomization, or groups of them; all by default."""
+    runs: Sequence[Path] = ()
+    """Finished runs, where those are evaluated."""
+    episodes: int = 200
+    """Of each of their evaluations."""
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A trial before its command has checked it."""
+
+    command: str
+    """``train``, ``ladder`` or ``evaluate``."""
+    settings: Settings
+    """What tells it from the others, by column of the table."""
+    fields: Mapping[str, Any]
+    """Its configuration, as far as the study decides it; all of it for ``evaluate``."""
+    under: Mapping[str, str] = field(default_factory=dict)
+    """See ``Trial``."""
+
+
+# ---- Studies that train ---------------------------------------------------------------------------------
+
+
+def _plan_arms(wish: Wish) -> list[Draft]:
+    return [Draft("ladder", {"seed": str(seed)}, {"seed": str(seed), "arms": ",".join(ARMS)}) for seed in wish.seeds]
+
+
+def _plan_presets(wish: Wish) -> list[Draft]:
+    return [
+        _training({"randomization": preset, "seed": str(seed)}, preset, seed, UNDER)
+        for preset in RANDOMIZATION_PRESETS
+        for seed in wish.seeds
+    ]
+
+
+def _training(settings: Settings, randomization: str, seed: int, under: Mapping[str, str]) -> Draft:
+    fields = {"agent": "ppo", "seed": str(seed), "randomization": randomization}
+    return Draft("train", settings, fields, under)
+
+
+def _plan_leave_one_out(wish: Wish) -> list[Draft]:
+    whole = Randomization.load(wish.randomization or RANDOMIZED)
+    parts = {name: GROUPS.get(name, (name,)) for name in wish.quantities or GROUPS}
+    left = {NOTHING: whole} | {name: whole.without(*quantities) for name, quantities in parts.items()}
+    idle = [name for name, rest in left.items() if name != NOTHING and rest == whole]
+    if idle and wish.quantities:
+        raise InputError(f"--quantities {idle[0]}: the randomization leaves that as it is, so nothing can be left out")
+    left = {name: rest for name, rest in left.items() if name not in idle} | {EVERYTHING: Randomization()}
+    under = {"whole": _text(whole), "none": "none"}
+    return [
+        _training({"without": name, "seed": str(seed)}, _text(rest), seed, under)
+        for name, rest in left.items()
+        for seed in wish.seeds
+    ]
+
+
+# ---- Studies of finished runs ---------------------------------------------------------------------------
+
+
+def _plan_one_at_a_time(wish: Wish) -> list[Draft]:
+    drafts = []
+    for run in _runs(wish):
+        ranges = Randomization.load(_varied(wish, run))
+        names = [name for name in ranges.names if PARAMETERS[name].acts_on != "layout"]
+        for name in _chosen(wish.quantities, names):
+            for value in _values(ranges, name):
+                settings = {"run": run.path.name, "quantity": name, "value": value}
+                drafts.append(_evaluation(settings, Randomization.fixed(**{name: float(value)}), run, wish))
+    return drafts
+
+
+def _values(ranges: Randomization, name: str) -> list[str]:
+    """The nominal value, and points on the way to both ends of the range and beyond, as far as is possible."""
+    parameter = PARAMETERS[name]
+    reached = [getattr(ranges.scaled(reach).only(name), name) for reach in REACHES]
+    values = {parameter.nominal} | {end for one in reached for end in (one.low, one.high)}
+    return list(dict.fromkeys(f"{value:.6g}" for value in sorted(values)))
+
+
+def _plan_strength(wish: Wish) -> list[Draft]:
+    return [
+        _evaluation({"run": run.path.name, "strength": f"{strength:g}"}, ranges.scaled(strength), run, wish)
+        for run in _runs(wish)
+        for ranges in [_part(Randomization.load(_varied(wish, run)), wish.quantities)]
+        for strength in STRENGTHS
+    ]
+
+
+def _part(ranges: Randomization, quantities: Sequence[str]) -> Randomization:
+    return ranges.only(*_chosen(quantities, ranges.names)) if quantities else ranges
+
+
+def _chosen(quantities: Sequence[str], names: Sequence[str]) -> list[str]:
+    """Those of the names that were asked for, alone or in groups."""
+    wanted = [one for name in quantities for one in GROUPS.get(name, (name,))]
+    unknown = [name for name in wanted if name not in PARAMETERS]
+    if unknown:
+        Randomization().without(*unknown)  # says what was meant
+    chosen = [name for name in names if not wanted or name in wanted]
+    if not chosen:
+        raise InputError(
+            f"nothing of {', '.join(quantities):.60} varies in that randomization: {', '.join(names):.100}"
+        )
+    return chosen
+
+
+def _runs(wish: Wish) -> list[RunDirectory]:
+    if not wish.runs:
+        raise InputError("this study evaluates finished runs: name them with --runs RUN ...")
+    runs = [RunDirectory.open(path.resolve()) for path in wish.runs]
+    for run in runs:
+        if not run.evaluation.is_file():
+            raise InputError(f"{str(run.path)!r} has no {run.evaluation.name}: the run has not finished")
+    names = [run.path.name for run in runs]
+    if len(set(names)) < len(names):
+        raise InputError(
+            f"two of the --runs are called {max(names, key=names.count)!r}: their rows could not be told apart"
+        )
+    return runs
+
+
+def _varied(wish: Wish, run: RunDirectory) -> str:
+    own = run.read_config().get("randomization", "none")
+    return wish.randomization or (own if own != "none" else RANDOMIZED)
+
+
+def _evaluation(settings: Settings, randomization: Randomization, run: RunDirectory, wish: Wish) -> Draft:
+    config = {
+        "command": "evaluate",
+        "run": str(run.path),
+        # A run that was made anew since then is another one.
+        "evaluation_sha256": hashlib.sha256(run.evaluation.read_bytes()).hexdigest(),
+        "randomization": _text(randomization),
+        "episodes": wish.episodes,
+    }
+    return Draft("evaluate", settings, config)
+
+
+def _text(randomization: Randomization) -> str:
+    return json.dumps(randomization.to_json())
+
+
+# ---- By name ---------------------------------------------------------------------------------------------
+
+PLANS: dict[str, Callable[[Wish], list[Draft]]] = {
+    "arms": _plan_arms,
+    "presets": _plan_presets,
+    "leave-one-out": _plan_leave_one_out,
+    "one-at-a-time": _plan_one_at_a_time,
+    "strength": _plan_strength,
+}
+EVALUATING = ("one-at-a-time", "strength")
+"""These evaluate finished runs and train nothing."""
+PARTS = {"default": ("arms", "presets")} | {name: (name,) for name in PLANS}
+"""Which of them a name on the command line stands for."""
+
+
+def plan(name: str, wish: Wish) -> list[Draft]:
+    """The trials of a study, in the order of its table.
+
+    Raises:
+        InputError: When a run, a quantity or a randomization is unknown or does not fit.
+    """
+    parts = PARTS[name]
+    drafts = []
+    for part in parts:
+        for draft in PLANS[part](wish):
+            settings = ({"study": part} if len(parts) > 1 else {}) | draft.settings
+            drafts.append(Draft(draft.command, settings, draft.fields, draft.under))
+    return drafts
