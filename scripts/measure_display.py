@@ -20,11 +20,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gridnav.agents import Planner
+from gridnav.agents import Agent, Planner
 from gridnav.display.recording import screenshot, write_recording
 from gridnav.display.viewer import address_of, free_port, is_open, wait_until
 from gridnav.experiment.evaluation import evaluate, policy_for
-from gridnav.experiment.live import SHARE, Spectator
+from gridnav.experiment.live import SHARE, Spectator, Watch
 from gridnav.experiment.policy_maps import policy_maps
 from gridnav.experiment.results import open_log
 from gridnav.experiment.run_directory import RunDirectory
@@ -73,8 +73,9 @@ def main() -> None:
 def live(steps: int) -> None:
     """What a training takes while it is watched over what it takes alone, by the clock and by the processor.
 
-    The processor's share counts the episode before the first step too, and can be trusted on a busy machine. Episodes
-    go to a server that draws nothing: what a viewer costs depends on the graphics card.
+    The processor's share counts the episode before the first step too. The clock's means nothing on a busy machine: the
+    share of the training's seconds in which it was looked at does. Episodes go to a server that draws nothing: what a
+    viewer costs depends on the graphics card.
     """
     port, ratios = free_port(), []
     rerun = Path(sys.executable).with_name("rerun")
@@ -88,7 +89,8 @@ def live(steps: int) -> None:
         for seed in range(ROUNDS):
             took = {is_watched: trained(steps, seed, port if is_watched else 0) for is_watched in order(seed)}
             ratios.append([took[True][i] / took[False][i] for i in range(2)])
-            words = f"{took[True][0]:.1f} s and {took[False][0]:.1f} s"
+            looked = took[True][2] / took[True][0]
+            words = f"{took[True][0]:.1f} s and {took[False][0]:.1f} s, {looked:.1%} of the first looking"
             print(f"  {words}: {ratios[-1][0]:.3f} by the clock, {ratios[-1][1]:.3f} by the processor", flush=True)
     finally:
         os.killpg(server.pid, signal.SIGKILL)
@@ -102,9 +104,26 @@ def order(number: int) -> tuple[bool, bool]:
     return (True, False) if number % 2 else (False, True)
 
 
-def trained(steps: int, seed: int, port: int) -> tuple[float, float]:
-    """Seconds of a training by the clock and by the processor, watched at a port if it is not 0."""
-    spectator = Spectator(PROBLEM, address_of(port), 20.0) if port else None
+class Timed(Spectator):
+    """Adds up what its looks took since the first step."""
+
+    looked_s = 0.0
+
+    def watch(self, name: str, world: str, observation: str) -> Watch:
+        """The same, timed."""
+        look = super().watch(name, world, observation)
+
+        def timed(agent: Agent, steps: int) -> None:
+            began = time.perf_counter()
+            look(agent, steps)
+            self.looked_s += (time.perf_counter() - began) * (steps > 0)
+
+        return timed
+
+
+def trained(steps: int, seed: int, port: int) -> tuple[float, float, float]:
+    """Seconds of a training by the clock, by the processor and looking, watched at a port if it is not 0."""
+    spectator = Timed(PROBLEM, address_of(port), 20.0) if port else None
     choice = Choice(changes={"steps": str(steps), "n_validations": "0"})
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -115,7 +134,7 @@ def trained(steps: int, seed: int, port: int) -> tuple[float, float]:
         workshop = Workshop(PROBLEM, budget, seed, run, log, quiet, spectator=spectator)
         began = time.process_time()
         seconds = workshop.train("ppo", "ppo", "DiffDrive", choice=choice).seconds
-        return seconds, time.process_time() - began
+        return seconds, time.process_time() - began, spectator.looked_s if spectator else 0.0
 
 
 def drive(steps: int) -> Episode:
