@@ -7,9 +7,7 @@ The first: times and size of a recording of 500 steps with 24 rays, a screenshot
 takes to come. The second: what ``--live`` costs a training of PPO on DiffDrive, with and without it in turn.
 """
 
-import json
 import os
-import resource
 import signal
 import statistics
 import subprocess
@@ -22,12 +20,15 @@ from pathlib import Path
 
 import numpy as np
 
-from gridnav.agents import Planner
+from gridnav.agents import Agent, Planner
 from gridnav.display.recording import screenshot, write_recording
-from gridnav.display.viewer import free_port, is_open, wait_until
+from gridnav.display.viewer import address_of, free_port, is_open, wait_until
 from gridnav.experiment.evaluation import evaluate, policy_for
-from gridnav.experiment.live import SHARE
+from gridnav.experiment.live import SHARE, Spectator, Watch
 from gridnav.experiment.policy_maps import policy_maps
+from gridnav.experiment.results import open_log
+from gridnav.experiment.run_directory import RunDirectory
+from gridnav.experiment.training import BUDGETS, Choice, Workshop
 from gridnav.experiment.video import write_video
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.metrics import Episode
@@ -72,10 +73,11 @@ def main() -> None:
 def live(steps: int) -> None:
     """What a training takes while it is watched over what it takes alone, by the clock and by the processor.
 
-    The processor's share counts the whole command and can be trusted on a busy machine. The episodes go to a server
-    that draws nothing: what a viewer costs depends on the graphics card.
+    The processor's share counts the episode before the first step too. The clock's means nothing on a busy machine: the
+    share of the training's seconds in which it was looked at does. Episodes go to a server that draws nothing: what a
+    viewer costs depends on the graphics card.
     """
-    port, clock, processor = free_port(), [], []
+    port, ratios = free_port(), []
     rerun = Path(sys.executable).with_name("rerun")
     server = subprocess.Popen(
         [rerun, "--serve-grpc", "--bind", "127.0.0.1", "--port", str(port)],
@@ -83,31 +85,56 @@ def live(steps: int) -> None:
     )  # fmt: skip
     try:
         wait_until(lambda: is_open(port), "start")
+        trained(10_000, 0, port)  # compiles and loads what both need
         for seed in range(ROUNDS):
-            took = {}
-            for watch in ((), ("--live-port", str(port)))[:: 1 if seed % 2 else -1]:
-                took[bool(watch)] = trained(steps, seed, watch)
-            clock.append(took[True][0] / took[False][0])
-            processor.append(took[True][1] / took[False][1])
-            print(f"  seed {seed}: {clock[-1]:.3f} by the clock, {processor[-1]:.3f} by the processor", flush=True)
+            took = {is_watched: trained(steps, seed, port if is_watched else 0) for is_watched in order(seed)}
+            ratios.append([took[True][i] / took[False][i] for i in range(2)])
+            looked = took[True][2] / took[True][0]
+            words = f"{took[True][0]:.1f} s and {took[False][0]:.1f} s, {looked:.1%} of the first looking"
+            print(f"  {words}: {ratios[-1][0]:.3f} by the clock, {ratios[-1][1]:.3f} by the processor", flush=True)
     finally:
         os.killpg(server.pid, signal.SIGKILL)
-    for name, ratios in (("clock", clock), ("processor", processor)):
-        middle, low, high = statistics.median(ratios), min(ratios), max(ratios)
+    for name, column in zip(("clock", "processor"), zip(*ratios, strict=True), strict=True):
+        middle, low, high = statistics.median(column), min(column), max(column)
         print(f"--live, {steps} steps of PPO on DiffDrive, by the {name}: {middle:.3f} ({low:.3f} to {high:.3f})")
 
 
-def trained(steps: int, seed: int, watch: tuple[str, ...]) -> tuple[float, float]:
-    """Seconds of a training by the clock, and of its whole command by the processor."""
-    quick = ("--budget", "quick", "--set", f"steps={5 * steps}")  # a fifth of the preset's
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    with tempfile.TemporaryDirectory() as folder:
-        run = Path(folder) / "run"
-        train = [sys.executable, "-m", "gridnav.cli", "train", "--agent", "ppo", "--seed", str(seed), *quick]
-        subprocess.run([*train, *watch, "--run-dir", str(run)], check=True, capture_output=True)
-        (row,) = json.loads((run / "evaluation.json").read_text())["results"].values()
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return row["training_seconds"], after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+def order(number: int) -> tuple[bool, bool]:
+    """With and without, in turn first."""
+    return (True, False) if number % 2 else (False, True)
+
+
+class Timed(Spectator):
+    """Adds up what its looks took since the first step."""
+
+    looked_s = 0.0
+
+    def watch(self, name: str, world: str, observation: str) -> Watch:
+        """The same, timed."""
+        look = super().watch(name, world, observation)
+
+        def timed(agent: Agent, steps: int) -> None:
+            began = time.perf_counter()
+            look(agent, steps)
+            self.looked_s += (time.perf_counter() - began) * (steps > 0)
+
+        return timed
+
+
+def trained(steps: int, seed: int, port: int) -> tuple[float, float, float]:
+    """Seconds of a training by the clock, by the processor and looking, watched at a port if it is not 0."""
+    spectator = Timed(PROBLEM, address_of(port), 20.0) if port else None
+    choice = Choice(changes={"steps": str(steps), "n_validations": "0"})
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        RunDirectory.create(Path(folder) / "run", "train", {}) as run,
+        open_log(run) as log,
+    ):
+        budget, quiet = BUDGETS["default"], lambda _: lambda _: None
+        workshop = Workshop(PROBLEM, budget, seed, run, log, quiet, spectator=spectator)
+        began = time.process_time()
+        seconds = workshop.train("ppo", "ppo", "DiffDrive", choice=choice).seconds
+        return seconds, time.process_time() - began, spectator.looked_s if spectator else 0.0
 
 
 def drive(steps: int) -> Episode:

@@ -10,7 +10,7 @@ from rerun.experimental import ViewerClient
 
 from gridnav.agents import Progress
 from gridnav.display.viewer import ViewerError, address_of, free_port, headless_viewer, wait_until
-from gridnav.experiment.live import Spectator
+from gridnav.experiment.live import Spectator, Watch
 from gridnav.experiment.results import open_log
 from gridnav.experiment.run_directory import RunDirectory
 from gridnav.experiment.training import Budget, Choice, Trained, Workshop
@@ -43,6 +43,21 @@ def test_episodes_arrive_in_the_viewer_and_training_is_the_same(tmp_path: Path) 
     for name, array in alone.agent.state().arrays.items():
         assert (array == watched.agent.state().arrays[name]).all()
     assert (tmp_path / "alone/metrics.jsonl").read_bytes() == (tmp_path / "watched/metrics.jsonl").read_bytes()
+
+
+def test_who_watches_is_asked_before_the_first_step_and_then_along_the_way(tmp_path: Path) -> None:
+    seen: list[int] = []
+
+    class Listed(Spectator):
+        def watch(self, name: str, world: str, observation: str) -> Watch:
+            return lambda agent, steps: seen.append(steps)
+
+    end = train(tmp_path / "run", Listed(PROBLEM, "rerun+http://127.0.0.1:1/proxy", 0.0)).steps
+
+    assert seen[0] == 0
+    assert len(seen) > 2
+    assert seen == sorted(seen)
+    assert seen[-1] <= end
 
 
 def test_training_goes_on_without_the_viewer(tmp_path: Path) -> None:
