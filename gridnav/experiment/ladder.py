@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from gridnav.experiment.arms import TABLE, Arm, Sources
@@ -20,7 +21,7 @@ from gridnav.experiment.run_directory import MetricsLog, RunDirectory
 from gridnav.experiment.training import Budget, Choice, OnStage, Result, Trained, Workshop, carry_weights
 from gridnav.experiment.transfer import QUESTION as TRANSFER_QUESTION
 from gridnav.experiment.transfer import SCRATCH, transfer_report, write_transfer
-from gridnav.experiment.worlds import Problem
+from gridnav.experiment.worlds import NOTHING_VARIES, Problem
 
 QUESTION = (
     "How far does a table learnt on the grid carry a wheeled robot, and what does a network save that "
@@ -47,7 +48,7 @@ def climb(
     """All rungs, in order, written to a run directory.
 
     Args:
-        problem: What is to be solved.
+        problem: What is to be solved. Where robots vary, there is one more rung for that; the others are without.
         budget: How much may be spent.
         seed: Of everything that is random in training.
         run: Where the files go.
@@ -58,7 +59,8 @@ def climb(
         spectator: Watches every training.
     """
     with open_log(run) as log:
-        workshop = Workshop(problem, budget, seed, run, log, on_stage, checkpoint_s=checkpoint_s, spectator=spectator)
+        nominal = replace(problem, randomization=NOTHING_VARIES)
+        workshop = Workshop(nominal, budget, seed, run, log, on_stage, checkpoint_s=checkpoint_s, spectator=spectator)
         plan = workshop.train("plan", "plan", "GridWorld")
         results = [workshop.evaluate("plan", plan, "GridWorld", "value iteration")]
 
@@ -79,6 +81,13 @@ def climb(
             "ppo-warm", "ppo", "DiffDrive", carry=carry_weights(unicycle.agent), choice=Choice("warm")
         )
         results.append(workshop.evaluate("ppo-warm", warm, "DiffDrive", "PPO warm-started", carried=network))
+        if problem != nominal:
+            workshop.problem = problem
+            varied = workshop.train("ppo-randomized", "ppo", "DiffDrive", carry=carry_weights(scratch.agent))
+            carried = "the network from scratch"
+            results.append(
+                workshop.evaluate("ppo-randomized", varied, "DiffDrive", "PPO under randomisation", carried=carried)
+            )
 
         _write(problem, seed, run, command, config, results, [table, warm], log)
     return results

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from gridnav.display.recording import write_recording
 from gridnav.display.report import Picture, Report, Rung, Table, write_report
+from gridnav.envs import Randomization
 from gridnav.experiment.checkpoint import LIBRARIES, last_standing, load_agent
 from gridnav.experiment.evaluation import EVALUATION_SEED, HELD_OUT_LAYOUTS, evaluate_in
 from gridnav.experiment.live import Spectator
@@ -46,6 +47,7 @@ def evaluation(results: Sequence[Result]) -> dict[str, Any]:
             "carried": result.carried,
             "checkpoint": result.checkpoint,
             "observation": result.observation,
+            "randomization": result.randomization,
             **asdict(result.summary),
             "training_steps": result.steps,
             "training_seconds": result.seconds,
@@ -236,12 +238,15 @@ def evaluate_again(
     Raises:
         InputError: When the run holds no evaluation or lacks a checkpoint.
     """
-    problem, rows = stored_evaluation(run, randomization)
+    varied = Randomization.load(randomization or "none").to_json()
+    problem, rows = stored_evaluation(run)
     results = []
     for name, row in rows.items():
         agent = load_agent(run.checkpoints, row["checkpoint"])
+        row["randomization"] = row["randomization"] if randomization is None else varied
+        here = replace(problem, randomization=Randomization.load(row["randomization"]))
         records = evaluate_in(
-            problem, agent, row["world"], episodes,
+            here, agent, row["world"], episodes,
             observation=row["observation"], seed=EVALUATION_SEED if seed is None else seed,
             on_progress=on_stage(f"evaluating {name}"),
         )  # fmt: skip
@@ -250,20 +255,23 @@ def evaluate_again(
     return results
 
 
-def stored_evaluation(run: RunDirectory, randomization: str | None = None) -> tuple[Problem, dict[str, dict[str, Any]]]:
+def stored_evaluation(run: RunDirectory) -> tuple[Problem, dict[str, dict[str, Any]]]:
     """What a finished run solved, and what is needed to evaluate each of its agents anew, by the name of its row.
 
-    Args:
-        run: With a config and an evaluation.
-        randomization: What varies; what varied in training by default.
+    What varied stands in the rows: the problem's robots are nominal.
 
     Raises:
         InputError: When the run holds no evaluation.
     """
     config, stored = run.read_config(), read_json(run.evaluation)
-    varied = config.get("randomization", "none") if randomization is None else randomization
     try:
-        problem = Problem.load(config["layout"], config["task"], config["reward"], varied)
-        return problem, {name: {key: row[key] for key in _NEEDED} for name, row in stored["results"].items()}
-    except (KeyError, TypeError, AttributeError) as error:
+        problem = Problem.load(config["layout"], config["task"], config["reward"])
+        rows = {name: {key: row[key] for key in _NEEDED} for name, row in stored["results"].items()}
+        for name, row in rows.items():
+            row["randomization"] = dict(stored["results"][name].get("randomization", {}))
+            Randomization.load(row["randomization"])
+        return problem, rows
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{str(run.path)!r} is no whole run: its {error} is missing or damaged") from None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from scipy import stats
 from gridnav.agents import Agent
 from gridnav.display.figures import kept_success
 from gridnav.display.report import Picture, Report, Table, write_report
+from gridnav.envs import Randomization
 from gridnav.experiment.checkpoint import load_agent
 from gridnav.experiment.evaluation import evaluate_in
 from gridnav.experiment.reality import WORLD, Reality, find_reality
@@ -111,7 +112,8 @@ def measure(
                 continue  # the same agent on the robot has a row of its own
             agent = load_agent(run.checkpoints, row["checkpoint"])
             label = name if len(runs) == 1 else f"{run.path.name} {name}"
-            gaps.append(_gap(label, run, problem, agent, row["world"], worlds, episodes, on_stage))
+            home = replace(problem, randomization=Randomization.load(row["randomization"]))
+            gaps.append(_gap(label, run, home, agent, row["world"], worlds, episodes, on_stage))
     return gaps
 
 

@@ -141,6 +141,8 @@ class Result:
     """What it sees on the grid."""
     maps: Mapping[Cell, PolicyMap] = field(default_factory=dict)
     """What the agent makes of the maze, for the goals of the episodes; none in a family of layouts."""
+    randomization: Mapping[str, Any] = field(default_factory=dict)
+    """What varied, as ``Randomization.to_json`` says it."""
 
     @cached_property
     def summary(self) -> Summary:
@@ -294,7 +296,10 @@ class Workshop:
         maps = policy_maps(self.problem, trained.agent, trained.world, goals, observation=trained.observation)
         own = name == trained.name
         steps, seconds = (trained.steps, trained.seconds) if own else (0, 0.0)
-        return Result(name, world, agent, carried, trained.name, episodes, steps, seconds, trained.observation, maps)
+        return Result(
+            name, world, agent, carried, trained.name, episodes, steps, seconds, trained.observation, maps,
+            self.problem.randomization.to_json(),
+        )  # fmt: skip
 
 
 def make_learner(
