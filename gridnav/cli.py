@@ -293,7 +293,8 @@ class Sweep:
         if self.study:
             from gridnav.experiment.findings import write_study
 
-            sentence = write_study(self.study, trials, outcomes, run, command=_again(run), config=config)
+            with _progress() as on_stage:
+                sentence = write_study(self.study, trials, outcomes, run, on_stage, command=_again(run), config=config)
             stdout.print(f"report     {run.report}\n{sentence}", markup=False)
         return 0
 

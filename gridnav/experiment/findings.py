@@ -9,17 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from gridnav.display.curves import success_bars
+from gridnav.display.curves import kept_success, success_bars
 from gridnav.display.report import Picture, Report, Table, write_report
 from gridnav.display.responses import Panel, Response, responses
 from gridnav.display.style import save_figure
 from gridnav.envs import PARAMETERS, Randomization
 from gridnav.experiment.across_seeds import labels_of
 from gridnav.experiment.run_directory import RunDirectory
+from gridnav.experiment.sim_to_real import Gap, correlation, measure_once
 from gridnav.experiment.studies import EVERYTHING, NOTHING, PARTS, UNDER
 from gridnav.experiment.sweep import Outcome, Trial
+from gridnav.experiment.training import OnStage
 from gridnav.experiment.transfer import transfer_report, write_transfer
 from gridnav.experiment.trials import Row
+from gridnav.problem.metrics import Summary
 from gridnav.problem.statistics import iqm, stratified_bootstrap
 from gridnav.problem.types import InputError
 
@@ -27,9 +30,11 @@ OVER_SEEDS = (
     "Interquartile means over seeds, of fewer than four the mean, with 95 % bootstrap intervals over them; with one "
     "seed the interval is Wilson's."
 )
+DEVELOPMENT = ("parametric", "structural")
+"""Realities that a study of presets looks at."""
 QUESTIONS = {
     "arms": "What does a robot save that begins with what was learnt on an easier rung?",
-    "presets": "Does training in a world that varies help where it varies?",
+    "presets": "Does training in a world that varies help in worlds that no training saw?",
     "leave-one-out": "Which part of the randomization does training need?",
     "one-at-a-time": "Which quantity of the robot may leave its nominal value, and how far?",
     "strength": "How much may everything vary together?",
@@ -58,29 +63,90 @@ class Findings:
 # ---- Studies that train ---------------------------------------------------------------------------------
 
 
-def _find_arms(done: Sequence[Done], sweep: RunDirectory) -> Findings:
+def _find_arms(done: Sequence[Done], sweep: RunDirectory, on_stage: OnStage) -> Findings:
     runs = [RunDirectory.open(one.trial.folder(sweep)) for one in done if not one.outcome.error]
     report = transfer_report(runs)
     write_transfer(sweep.figures, report)
     return Findings(report.sentence, [report.table], {"transfer": report.picture})
 
 
-def _find_presets(done: Sequence[Done], sweep: RunDirectory) -> Findings:
+def _find_presets(done: Sequence[Done], sweep: RunDirectory, on_stage: OnStage) -> Findings:
     cells = _cells(done, "randomization")
     presets = list(dict.fromkeys(preset for preset, _ in cells))
-    best = max(presets, key=lambda preset: np.mean([cells[preset, under].success[0] for under in UNDER]))
-    told = ", ".join(f"{_interval(cells[best, under].success)} under {under}" for under in UNDER)
-    sentence = f"PPO trained under {best} is best on average over {', '.join(UNDER)}: {told}"
-    if best != "none" and "none" in presets:
-        told = ", ".join(f"{_interval(cells['none', under].success)} under {under}" for under in UNDER)
-        sentence += f"; trained without randomization it reaches {told}"
     bars = {f"{preset}, tested under {under}": cells[preset, under].success for under in UNDER for preset in presets}
     caption = "Success of PPO trained under each preset, tested where nothing varies, under burger and under wide."
     table = _matrix("Trained under, tested under", "trained under", cells, presets, list(UNDER))
-    return Findings(sentence + ".", [table], {"presets": Picture(success_bars(bars, target=None), caption)})
+    runs = {
+        f"{one.trial.settings['randomization']} {one.trial.settings['seed']}": RunDirectory.open(
+            one.trial.folder(sweep)
+        )
+        for one in done
+        if not one.outcome.error
+    }
+    episodes = int(done[0].outcome.rows[0]["episodes"])
+    gaps = measure_once(runs, DEVELOPMENT, episodes, on_stage)
+    by_preset: dict[str, list[Gap]] = {preset: [] for preset in presets}
+    for one, gap in zip(finished, gaps.values(), strict=True):
+        by_preset[one.settings["randomization"]].append(gap)
+    return Findings(
+        " ".join(_kept_words(by_preset, place) for place in DEVELOPMENT),
+        [_kept_table(by_preset), table],
+        {"realities": _kept_picture(by_preset), "presets": Picture(success_bars(bars, target=None), caption)},
+    )
 
 
-def _find_leave_one_out(done: Sequence[Done], sweep: RunDirectory) -> Findings:
+def _kept_words(gaps: Mapping[str, Sequence[Gap]], place: str) -> str:
+    """Which preset keeps most in a reality, against training without one, and how far home foretells it."""
+    away = {name: _successes([gap.away[place] for gap in here]) for name, here in gaps.items()}
+    best = max(away, key=lambda name: away[name][0])
+    home = _successes([gap.at_home for gap in gaps[best]])
+    words = f"In the {place} reality PPO trained under {best} does best: {_interval(away[best])}, and at home "
+    words += _interval(home)
+    if best != "none" and "none" in away:
+        words += f"; trained where nothing varies it reaches {_interval(away['none'])}"
+    found = correlation([gap for here in gaps.values() for gap in here], place)
+    low, high = found.pearson_interval
+    return (
+        f"{words}. Over {found.n_policies} policies, success at home and there correlate by {found.pearson:.2f} "
+        f"({low:.2f} to {high:.2f})."
+    )
+
+
+def _kept_table(gaps: Mapping[str, Sequence[Gap]]) -> Table:
+    rows = []
+    for name, here in gaps.items():
+        for place in DEVELOPMENT:
+            kept = [gap.retention(place)[0] for gap in here]
+            away = [gap.away[place] for gap in here]
+            rows.append(
+                [name, place, _interval(_successes([gap.at_home for gap in here])), _interval(_successes(away)),
+                 f"{float(iqm(kept)):.2f} ({min(kept):.2f} to {max(kept):.2f})",
+                 _percent(float(iqm([one.collision_rate for one in away])))]
+            )  # fmt: skip
+    columns = ("trained under", "reality", "success at home", "success there", "kept", "collided there")
+    legend = f"Home is what the policy was trained under. Kept: mean and range over seeds. {OVER_SEEDS}"
+    return Table("What was kept in worlds that no training saw", columns, rows, legend)
+
+
+def _kept_picture(gaps: Mapping[str, Sequence[Gap]]) -> Picture:
+    home = {name: _successes([gap.at_home for gap in here]) for name, here in gaps.items()}
+    away = {
+        place: {name: _successes([gap.away[place] for gap in here]) for name, here in gaps.items()}
+        for place in DEVELOPMENT
+    }
+    words = "Success of PPO trained under each preset, at home (ring) and in realities that no training saw."
+    return Picture(kept_success(home, away), f"{words} All of them are simulations. {OVER_SEEDS}")
+
+
+def _successes(summaries: Sequence[Summary]) -> tuple[float, float, float]:
+    """Middle and interval over seeds."""
+    if len(summaries) == 1:
+        return summaries[0].success_rate, *summaries[0].success_interval
+    scores = [one.success_rate for one in summaries]
+    return float(iqm(scores)), *stratified_bootstrap([scores], rng=np.random.default_rng(0))
+
+
+def _find_leave_one_out(done: Sequence[Done], sweep: RunDirectory, on_stage: OnStage) -> Findings:
     cells = _cells(done, "without")
     names = list(dict.fromkeys(name for name, _ in cells))
     parts = [name for name in names if name not in (NOTHING, EVERYTHING)]
@@ -101,7 +167,7 @@ def _find_leave_one_out(done: Sequence[Done], sweep: RunDirectory) -> Findings:
 # ---- Studies of finished runs ---------------------------------------------------------------------------
 
 
-def _find_one_at_a_time(done: Sequence[Done], sweep: RunDirectory) -> Findings:
+def _find_one_at_a_time(done: Sequence[Done], sweep: RunDirectory, on_stage: OnStage) -> Findings:
     lines = _lines(done, "quantity", "value")
     quantities = list(dict.fromkeys(one.trial.settings["quantity"] for one in done))
     trained = _trained(done)
@@ -136,7 +202,7 @@ def _find_one_at_a_time(done: Sequence[Done], sweep: RunDirectory) -> Findings:
     )
 
 
-def _find_strength(done: Sequence[Done], sweep: RunDirectory) -> Findings:
+def _find_strength(done: Sequence[Done], sweep: RunDirectory, on_stage: OnStage) -> Findings:
     lines = {label: line for (label, _), line in _lines(done, "", "strength").items()}
     area = {label: float(np.trapezoid(line.y, line.x) / (line.x[-1] - line.x[0])) for label, line in lines.items()}
     best = max(area, key=lambda label: area[label])
@@ -248,7 +314,7 @@ def _ends(low: float, high: float) -> str:
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
-FINDERS: dict[str, Callable[[Sequence[Done], RunDirectory], Findings]] = {
+FINDERS: dict[str, Callable[[Sequence[Done], RunDirectory, OnStage], Findings]] = {
     "arms": _find_arms,
     "presets": _find_presets,
     "leave-one-out": _find_leave_one_out,
@@ -262,6 +328,7 @@ def write_study(
     trials: Sequence[Trial],
     outcomes: Sequence[Outcome],
     sweep: RunDirectory,
+    on_stage: OnStage,
     *,
     command: str,
     config: Mapping[str, Any],
@@ -273,6 +340,7 @@ def write_study(
         trials: All of them.
         outcomes: What came of them.
         sweep: Where the files go.
+        on_stage: Told of evaluations in realities.
         command: What makes the study again.
         config: Its configuration.
 
@@ -286,7 +354,7 @@ def write_study(
     found = []
     for part in PARTS[name]:
         own = [one for one in done if one.trial.settings.get("study", part) == part]
-        found.append(FINDERS[part](own, sweep))
+        found.append(FINDERS[part](own, sweep, on_stage))
     pictures = {name: picture for one in found for name, picture in one.pictures.items()}
     for file, picture in pictures.items():
         for ending in (".png", ".svg"):

@@ -20,12 +20,14 @@ from gridnav.experiment.checkpoint import load_agent
 from gridnav.experiment.evaluation import evaluate_in
 from gridnav.experiment.reality import WORLD, Reality, find_reality
 from gridnav.experiment.results import stored_evaluation
-from gridnav.experiment.run_directory import RunDirectory
+from gridnav.experiment.run_directory import RunDirectory, read_json, write_json
 from gridnav.experiment.training import OnStage
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.metrics import Summary, summarise
 from gridnav.problem.types import FloatArray
 
+MEASURED = "realities.json"
+"""In a run: what ``measure_once`` found."""
 SEALED_LOG = "sealed-evaluations.jsonl"
 """In a run: one line for every time one of its policies was measured in the test reality."""
 DRAWS = 10_000
@@ -115,6 +117,38 @@ def measure(
             home = replace(problem, randomization=Randomization.load(row["randomization"]))
             gaps.append(_gap(label, run, home, agent, row["world"], worlds, episodes, on_stage))
     return gaps
+
+
+def measure_once(
+    runs: Mapping[str, RunDirectory], realities: Sequence[str], episodes: int, on_stage: OnStage
+) -> dict[str, Gap]:
+    """The last policy of each run, at home and in realities; what an earlier call measured is read from the run.
+
+    Args:
+        runs: Finished runs by what their policies are called. Each belongs to the caller.
+        realities: Names.
+        episodes: Of each policy in each world.
+        on_stage: Told of every evaluation.
+    """
+    gaps = {}
+    for name, run in runs.items():
+        file = run.path / MEASURED
+        asked = {"realities": list(realities), "episodes": episodes}
+        stored = read_json(file) if file.is_file() else {}
+        if any(stored.get(key) != value for key, value in asked.items()):
+            gap = measure([run], realities, episodes, on_stage)[-1]
+            away = {place: asdict(summary) for place, summary in gap.away.items()}
+            # As it will be read.
+            stored = json.loads(json.dumps(asked | {"home": asdict(gap.at_home), "away": away}))
+            write_json(file, stored)
+        away = {place: _summary(one) for place, one in stored["away"].items()}
+        gaps[name] = Gap(name, _summary(stored["home"]), away)
+    return gaps
+
+
+def _summary(stored: Mapping[str, Any]) -> Summary:
+    values: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in stored.items()}
+    return Summary(**values)
 
 
 def _gap(

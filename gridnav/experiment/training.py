@@ -70,7 +70,8 @@ class Choice:
         if self.preset:
             return self.preset
         if kind == "ppo":
-            return "layouts" if problem.family else "any" if problem.task.goals == "any" else "default"
+            varied = "randomized" if problem.randomization.names else "default"
+            return "layouts" if problem.family else "any" if problem.task.goals == "any" else varied
         return self.observation if self.observation != "cell_goal" else "default"
 
 
