@@ -76,13 +76,8 @@ def _find_presets(done: Sequence[Done], sweep: RunDirectory, on_stage: OnStage) 
     bars = {f"{preset}, tested under {under}": cells[preset, under].success for under in UNDER for preset in presets}
     caption = "Success of PPO trained under each preset, tested where nothing varies, under burger and under wide."
     table = _matrix("Trained under, tested under", "trained under", cells, presets, list(UNDER))
-    runs = {
-        f"{one.trial.settings['randomization']} {one.trial.settings['seed']}": RunDirectory.open(
-            one.trial.folder(sweep)
-        )
-        for one in done
-        if not one.outcome.error
-    }
+    finished = [one.trial for one in done if not one.outcome.error]
+    runs = {" ".join(one.settings.values()): RunDirectory.open(one.folder(sweep)) for one in finished}
     episodes = int(done[0].outcome.rows[0]["episodes"])
     gaps = measure_once(runs, DEVELOPMENT, episodes, on_stage)
     by_preset: dict[str, list[Gap]] = {preset: [] for preset in presets}
