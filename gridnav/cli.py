@@ -163,12 +163,16 @@ class Ladder(_Run):
         """The problem, and the configuration as JSON values that need no other file, once all is known to be right."""
         from gridnav.experiment.arms import choose_arms
 
-        if self.arms:
-            choose_arms(self.arms)
+        arms = choose_arms(self.arms) if self.arms is not None else {}
         problem, config = self._problem()
         if problem.family is not None:
             raise InputError(
                 "the ladder needs one maze: its plan and its table are of one; train ppo on random layouts"
+            )
+        if arms and problem.randomization.acts_on("layout"):
+            raise InputError(
+                f"--randomization {self.randomization!r:.60} varies the maze, and what arms carry over is of one: leave "
+                "the quantities of mazes out"
             )
         return problem, config
 
@@ -178,7 +182,7 @@ class Ladder(_Run):
         from gridnav.experiment.ladder import climb, compare
 
         problem, config = self.checked()
-        arms = choose_arms(self.arms) if self.arms else {}
+        arms = choose_arms(self.arms) if self.arms is not None else {}
         budget = BUDGETS[self.budget]
         with self._directory("ladder", config) as run, _progress() as on_stage:
             how: dict[str, Any] = {"checkpoint_s": self.checkpoint_s, "spectator": self._spectator(problem)}

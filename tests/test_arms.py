@@ -366,6 +366,14 @@ def test_wrong_arms_are_refused(names: str, words: str) -> None:
         choose_arms(names)
 
 
+def test_arms_are_refused_where_the_maze_varies(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = tmp_path / "run"
+    arguments = ("ladder", "--arms", "scratch", "--randomization", '{"obstacles_moved": [0, 3]}', "--run-dir", str(run))
+    assert run_cli(*arguments) == 2
+    assert "varies the maze" in capsys.readouterr().err
+    assert not run.exists()
+
+
 def test_an_unknown_arm_ends_the_command_with_one_line_and_nothing_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -31,7 +31,7 @@ def demonstrate(
         seed: Of episodes and noise.
         steps: Of each robot.
     """
-    worlds = problem.training_worlds(world, ROBOTS, exploring_starts=EXPLORING_STARTS)
+    worlds = problem.for_evaluation.training_worlds(world, ROBOTS, exploring_starts=EXPLORING_STARTS)
     commands = follow(agent.act, worlds)  # type: ignore[arg-type]
     episodes, noise = np.random.SeedSequence([seed, ROBOTS]).spawn(2)
     rng = np.random.default_rng(noise)

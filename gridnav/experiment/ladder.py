@@ -160,7 +160,7 @@ def _train(name: str, arm: Arm, workshop: Workshop, sources: Sources, log: Metri
         carry = arm.prepare(workshop.problem, made)
         return workshop.train(name, "ppo", TARGET, carry=carry, with_curve=True)
     if not log.curve(name, SUCCESS)[0]:  # or an earlier process was here
-        curve = GreedyCurve(workshop.problem.worlds(TARGET, CURVE_EPISODES), 1)
+        curve = GreedyCurve(workshop.problem.for_evaluation.worlds(TARGET, CURVE_EPISODES), 1)
         log.add(name, 0, curve.measure(made[-1].agent))
         curve.close()
     return made[-1]

@@ -236,7 +236,8 @@ class Workshop:
             agent.teacher = carry.teacher  # type: ignore[attr-defined]
         validation = make_validation(self.problem, agent, world, steps, self.budget, saved)
         watch = self._spectator.watch(name, world, choice.observation) if self._spectator else None
-        curve = GreedyCurve(self.problem.worlds(world, CURVE_EPISODES), steps) if with_curve else None
+        judged = self.problem.for_evaluation
+        curve = GreedyCurve(judged.worlds(world, CURVE_EPISODES), steps) if with_curve else None
         course = Course(
             name,
             agent,
@@ -347,9 +348,11 @@ def make_learner(
     if carry.begin is not None:
         agent = carry.begin(agent)
     steps = int(agent.planned_steps * budget.share)
-    if carry.wrap is not None and isinstance(worlds, NavigationVectorEnv):
-        return agent, carry.wrap(worlds, agent), steps
-    return agent, worlds, steps
+    if carry.wrap is None:
+        return agent, worlds, steps
+    if not isinstance(worlds, NavigationVectorEnv):
+        raise InputError("what is carried is of one maze: it cannot help in mazes that change")
+    return agent, carry.wrap(worlds, agent), steps
 
 
 def make_validation(
