@@ -65,7 +65,7 @@ def responses(panels: Sequence[Panel], *, y_label: str = "success rate") -> Figu
     if alone:
         grid[0, 0].set(xlabel=panels[0].title, ylabel=y_label, title="")
     else:
-        figure.supylabel(y_label)
+        figure.supylabel(y_label, fontsize=STYLE["font.size"])
     # Each name once, though it is in several panels.
     handles = {
         label: handle for axes in grid.flat for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)

@@ -151,7 +151,8 @@ def _find_leave_one_out(done: Sequence[Done], sweep: RunDirectory, on_stage: OnS
         f"Under the whole randomization, PPO that was trained in it reaches {reached[NOTHING]}; what it misses most is "
         f"{worst}: trained without, it reaches {reached[worst]}, and without everything {reached[EVERYTHING]}."
     )
-    bars = {f"without {name}": cells[name, "whole"].success for name in names}
+    words = {NOTHING: "trained in all of it", EVERYTHING: "trained in none of it"}
+    bars = {words.get(name, f"without {name}"): cells[name, "whole"].success for name in names}
     picture = Picture(
         success_bars(bars, target=None), "Success under the whole randomization, by what training lacked."
     )

@@ -1,0 +1,248 @@
+"""Ready-made studies: which trials they do, and that their sentences say what their numbers say."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+from command_line import run_cli
+from matplotlib import pyplot as plt
+
+from gridnav.display.responses import Panel, Response, responses
+from gridnav.envs import PARAMETERS, RANDOMIZATION_PRESETS, Randomization
+from gridnav.experiment.findings import write_study
+from gridnav.experiment.run_directory import RunDirectory
+from gridnav.experiment.studies import GROUPS, Draft, Wish, plan
+from gridnav.experiment.sweep import Outcome, Trial
+from gridnav.problem.types import InputError
+
+
+def finished(path: Path, randomization: str = "none") -> Path:
+    """What the plan of a study looks at in a finished run."""
+    path.mkdir()
+    (path / "config.json").write_text(json.dumps({"command": "train", "seed": 0, "randomization": randomization}))
+    (path / "evaluation.json").write_text("{}")
+    return path
+
+
+# ---- Plans -----------------------------------------------------------------------------------------
+
+
+def test_presets_trains_under_each_preset_with_each_seed_and_tests_in_the_same_places() -> None:
+    drafts = plan("presets", Wish(seeds=(0, 1)))
+
+    assert [(one.settings["randomization"], one.settings["seed"]) for one in drafts] == [
+        (preset, seed) for preset in RANDOMIZATION_PRESETS for seed in ("0", "1")
+    ]
+    assert {tuple(one.under) for one in drafts} == {("none", "burger", "wide")}
+    assert all(one.fields["agent"] == "ppo" for one in drafts)
+
+
+def test_leave_one_out_leaves_out_one_group_at_a_time() -> None:
+    drafts = plan("leave-one-out", Wish(seeds=(0,)))
+
+    lacks = {one.settings["without"]: Randomization.load(one.fields["randomization"]) for one in drafts}
+    whole = RANDOMIZATION_PRESETS["burger"]
+    assert [*lacks] == ["nothing", *GROUPS, "everything"]
+    assert lacks["nothing"] == whole
+    assert lacks["everything"] == Randomization()
+    for group in GROUPS:
+        assert set(lacks[group].names) == {name for name in whole.names if PARAMETERS[name].acts_on != group}
+
+
+def test_one_at_a_time_goes_beyond_both_ends_of_the_range(tmp_path: Path) -> None:
+    run = finished(tmp_path / "run")
+    wish = Wish(runs=[run], quantities=["wheel_separation"])
+
+    drafts = plan("one-at-a-time", wish)
+
+    # By hand: burger's range is 0.95 to 1.05 around 1, reached by halves, up to twice as far.
+    assert [one.settings["value"] for one in drafts] == ["0.9", "0.925", "0.95", "0.975", "1",
+                                                         "1.025", "1.05", "1.075", "1.1"]  # fmt: skip
+    first = Randomization.load(drafts[0].fields["randomization"])
+    assert first == Randomization.fixed(wheel_separation=0.9)
+
+
+def test_values_stay_within_what_is_possible(tmp_path: Path) -> None:
+    run = finished(tmp_path / "run")
+
+    for name in RANDOMIZATION_PRESETS["wide"].names:
+        drafts = plan("one-at-a-time", Wish(runs=[run], quantities=[name], randomization="wide"))
+        values = [float(one.settings["value"]) for one in drafts]
+        assert values == sorted(set(values))
+        assert PARAMETERS[name].lowest <= values[0] < values[-1] <= PARAMETERS[name].highest
+
+
+def test_strength_scales_what_the_run_was_trained_in(tmp_path: Path) -> None:
+    run = finished(tmp_path / "run", "force-only")
+
+    drafts = plan("strength", Wish(runs=[run]))
+
+    # By hand: 0 to 2 in quarters.
+    assert [one.settings["strength"] for one in drafts] == ["0", "0.25", "0.5", "0.75", "1", "1.25", "1.5", "1.75", "2"]
+    varied = [Randomization.load(one.fields["randomization"]) for one in drafts]
+    assert varied[0] == Randomization()
+    assert varied[4] == RANDOMIZATION_PRESETS["force-only"]
+
+
+def test_the_default_study_is_arms_and_presets() -> None:
+    drafts = plan("default", Wish(seeds=(0, 1, 2)))
+
+    parts = [one.settings["study"] for one in drafts]
+    assert parts == ["arms"] * 3 + ["presets"] * 3 * len(RANDOMIZATION_PRESETS)
+
+
+@pytest.mark.parametrize(
+    ("study", "wish", "named"),
+    [
+        ("strength", Wish(), "--runs"),
+        ("strength", Wish(runs=[Path("missing")]), "missing"),
+        ("strength", Wish(runs=[Path("run")], quantities=["wheel_radios"]), "wheel_radius"),
+        ("one-at-a-time", Wish(runs=[Path("run")], quantities=["cell_size"]), "cell_size"),
+        ("leave-one-out", Wish(quantities=["wheel_radios"]), "wheel_radius"),
+        ("leave-one-out", Wish(quantities=["command"], randomization="force-only"), "command"),
+        ("leave-one-out", Wish(randomization="burgr"), "burgr"),
+    ],
+)
+def test_what_no_study_can_do_is_refused(study: str, wish: Wish, named: str) -> None:
+    finished(Path("run"))
+
+    with pytest.raises(InputError, match=named):
+        plan(study, wish)
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--study", "presents"], "presents"),
+        (["--study", "presets", "--grid", "seed=0,1"], "--grid"),
+        (["--study", "presets", "--seeds", "0"], "--seeds 0"),
+        (["--study", "presets", "--runs", "a"], "--runs"),
+        (["--study", "strength"], "--runs"),
+        (["--study", "strength", "--runs", "missing"], "missing"),
+        (["--study", "strength", "--seeds", "3"], "--seeds"),
+        (["--study", "strength", "--layout", "open"], "--layout"),
+        (["--study", "strength", "--runs", "a", "--episodes", "0"], "--episodes 0"),
+        (["--seeds", "3", "--grid", "seed=0,1"], "--seeds"),
+    ],
+)
+def test_bad_flags_get_one_line_and_nothing_is_written(
+    words: list[str], named: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_cli("sweep", *words) == 2
+
+    (line,) = capsys.readouterr().err.splitlines()
+    assert named in line
+    assert list(Path.cwd().iterdir()) == []
+
+
+# ---- Findings --------------------------------------------------------------------------------------
+
+
+def conclude(study: str, drafts: list[Draft], successes: Mapping[tuple[str, str], float], column: str) -> str:
+    """The sentence of a study whose trials came to these, by a setting and where they were tested."""
+    trials = [Trial(number, one.settings, one.fields, one.under) for number, one in enumerate(drafts)]
+    outcomes = [
+        Outcome([row(successes[one.settings[column], under], under) for under in one.under] if one.under else [])
+        for one in trials
+    ]
+    with RunDirectory.create(Path("study"), "sweep", {}) as sweep:
+        return write_study(study, trials, outcomes, sweep, command="", config={})
+
+
+def row(success: float, under: str) -> dict[str, object]:
+    return {"under": under, "name": "ppo", "world": "DiffDrive", "success": success, "spl": 0.5, "collided": 0.0}
+
+
+def test_presets_names_the_best_on_average_and_what_nominal_training_reaches() -> None:
+    drafts = plan("presets", Wish(seeds=(0, 1)))
+    successes = {(name, under): 0.5 for name in RANDOMIZATION_PRESETS for under in ("none", "burger", "wide")}
+    # By hand: means over the three are 0.9, 0.7 and 0.5 for the rest.
+    successes |= {("burger", "none"): 0.95, ("burger", "burger"): 0.9, ("burger", "wide"): 0.85}
+    successes |= {("none", "none"): 1.0, ("none", "burger"): 0.6}
+
+    sentence = conclude("presets", drafts, successes, "randomization")
+
+    assert sentence == (
+        "PPO trained under burger is best on average over none, burger, wide: 95.0 % under none, 90.0 % under burger, "
+        "85.0 % under wide; trained without randomization it reaches 100.0 % under none, 60.0 % under burger, 50.0 % "
+        "under wide."
+    )
+    assert sentence in Path("study/report.html").read_text(encoding="utf-8")
+    assert {path.name for path in Path("study/figures").iterdir()} == {"presets.png", "presets.svg"}
+
+
+def test_leave_one_out_names_what_is_missed_most() -> None:
+    drafts = plan("leave-one-out", Wish(seeds=(0, 1)))
+    names = {one.settings["without"] for one in drafts}
+    successes = {(name, under): 0.9 for name in names for under in ("whole", "none")}
+    successes |= {("sense", "whole"): 0.6, ("everything", "whole"): 0.3}
+
+    sentence = conclude("leave-one-out", drafts, successes, "without")
+
+    assert "reaches 90.0 %; what it misses most is sense" in sentence
+    assert "reaches 60.0 %, and without everything 30.0 %" in sentence
+
+
+def test_a_study_all_of_whose_trials_of_a_kind_failed_says_so() -> None:
+    drafts = plan("presets", Wish(seeds=(0,)))
+    trials = [Trial(number, one.settings, one.fields, one.under) for number, one in enumerate(drafts)]
+
+    with (
+        RunDirectory.create(Path("study"), "sweep", {}) as sweep,
+        pytest.raises(InputError, match="every trial of burger failed"),
+    ):
+        write_study("presets", trials, [Outcome([], "boom")] * len(trials), sweep, command="", config={})
+
+
+def test_responses_draws_each_point_with_its_interval_and_marks_the_range_of_training() -> None:
+    line = Response([0.0, 1.0], [0.5, 0.25], [0.4, 0.1], [0.7, 0.5])
+
+    figure = responses([Panel("mass (x)", {"ppo": line}, (0.8, 1.3)), Panel("tilt (rad)", {"ppo": line}, (0.0, 0.0))])
+
+    first, second = figure.axes
+    assert first.get_title() == "mass (x)"
+    (bars,) = first.containers[0].lines[2]
+    ends = [[point[1] for point in segment] for segment in bars.get_segments()]
+    assert ends == [[pytest.approx(0.4), pytest.approx(0.7)], [pytest.approx(0.1), pytest.approx(0.5)]]
+    (shade,) = [patch for patch in first.patches if patch.get_gid() == "trained"]
+    assert (shade.get_x(), shade.get_width()) == (pytest.approx(0.8), pytest.approx(0.5))
+    (mark,) = [line for line in second.lines if line.get_gid() == "trained"]
+    assert mark.get_xdata() == [0.0, 0.0]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["range in training", "ppo", "in training"]
+    assert plt.get_fignums() == []
+
+
+# ---- From one end to the other -----------------------------------------------------------------------
+
+
+def test_a_study_of_a_finished_run_writes_a_report_and_knows_when_the_run_is_another_one(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    small = ["steps=640", "num_envs=8", "n_steps=8", "hidden=[16]", "batch_size=32", "n_validations=0"]
+    problem = ["--agent", "ppo", "--layout", "SG", "--env", "gridnav/Unicycle-v0", "--budget", "quick"]
+    assert run_cli("sweep", *problem, "--set", *small, "--grid", "seed=3", "--jobs", "1", "--run-dir", "runs") == 0
+    run = Path("runs/trials/0000")
+    study = ["sweep", "--study", "strength", "--runs", str(run), "--episodes", "2", "--jobs", "1"]
+
+    assert run_cli(*study, "--quantities", "command", "--run-dir", "study") == 0
+
+    table = Path("study/results.csv").read_text().splitlines()
+    assert table[0].startswith("trial,run,strength,name,world,episodes,success,")
+    assert [line.split(",")[2] for line in table[1:]] == ["0", "0.25", "0.5", "0.75", "1", "1.25", "1.5", "1.75", "2"]
+    assert "<svg" in Path("study/report.html").read_text(encoding="utf-8")
+    assert (Path("study/figures/strength.png")).is_file()
+    before = {path: path.stat().st_mtime_ns for path in Path("study/trials").rglob("*")}
+    assert run_cli("sweep", "--resume", "--run-dir", "study", "--jobs", "1") == 0
+    assert {path: path.stat().st_mtime_ns for path in Path("study/trials").rglob("*")} == before
+    assert Path("study/results.csv").read_text().splitlines() == table
+    capsys.readouterr()
+
+    evaluation = run / "evaluation.json"
+    evaluation.write_text(evaluation.read_text() + " ")
+
+    assert run_cli("sweep", "--resume", "--run-dir", "study", "--jobs", "1") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "another config" in line
