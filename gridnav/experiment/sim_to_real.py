@@ -137,9 +137,9 @@ def measure_once(
         stored = read_json(file) if file.is_file() else {}
         if any(stored.get(key) != value for key, value in asked.items()):
             gap = measure([run], realities, episodes, on_stage)[-1]
-            away = {place: asdict(summary) for place, summary in gap.away.items()}
+            there = {place: asdict(summary) for place, summary in gap.away.items()}
             # As it will be read.
-            stored = json.loads(json.dumps(asked | {"home": asdict(gap.at_home), "away": away}))
+            stored = json.loads(json.dumps(asked | {"home": asdict(gap.at_home), "away": there}))
             write_json(file, stored)
         away = {place: _summary(one) for place, one in stored["away"].items()}
         gaps[name] = Gap(name, _summary(stored["home"]), away)
