@@ -171,8 +171,8 @@ class Ladder(_Run):
             )
         if arms and problem.randomization.acts_on("layout"):
             raise InputError(
-                f"--randomization {self.randomization!r:.60} varies the maze, and what arms carry over is of one: leave "
-                "the quantities of mazes out"
+                f"--randomization {self.randomization!r:.60} varies the maze, and what arms carry over is of one: "
+                "leave the quantities of mazes out"
             )
         return problem, config
 

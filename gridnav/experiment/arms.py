@@ -7,7 +7,7 @@ one, write such a function, three lines as a rule, and name it in ``ARMS``.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
@@ -71,9 +71,13 @@ def potential(problem: Problem, sources: Sequence[Trained]) -> Carry:
 
 
 def clone(problem: Problem, sources: Sequence[Trained]) -> Carry:
-    """The cloned policy and its critic, which first learns what the target's steps are worth."""
+    """The cloned policy and its critic, which first learns what the target's steps are worth.
+
+    The policy is drawn to what it was for half of the training: left to itself it forgot more than it learnt.
+    """
     *_, cloned = sources
-    return carry_weights(cloned.agent, learning_rate="5e-4", log_std_init="-1.5", critic_only_steps="16000")
+    careful = {"learning_rate": "5e-4", "log_std_init": "-1.5", "critic_only_steps": "16000", "teacher_share": "0.5"}
+    return replace(carry_weights(cloned.agent, **careful), teacher=cloned.agent)  # type: ignore[arg-type]
 
 
 def kickstart(problem: Problem, sources: Sequence[Trained]) -> Carry:
