@@ -51,14 +51,16 @@ class Draws:
     def __init__(self, randomization: Randomization, n: int) -> None:
         self.randomization = randomization
         self.names = randomization.names
-        self.columns = np.array([COLUMN[name] for name in self.names], dtype=np.int64)
-        ranges = [getattr(randomization, name) for name in self.names]
+        # The maze is the whole batch's: who draws it writes down what was drawn.
+        own = [name for name in self.names if PARAMETERS[name].acts_on != "layout"]
+        self.columns = np.array([COLUMN[name] for name in own], dtype=np.int64)
+        ranges = [getattr(randomization, name) for name in own]
         self._is_log = np.array([one.law == "log" for one in ranges], dtype=bool)
         self._low, self._high = (np.array([getattr(one, end) for one in ranges]) for end in ("low", "high"))
         nominal = NOMINAL[self.columns]
         self._lowest, self._highest = np.minimum(self._low, nominal), np.maximum(self._high, nominal)
         # Other names than those of the numbers within an episode: a noise's size says nothing of its values.
-        self._ids = np.array([name_id(f"size of {name}") for name in self.names], dtype=np.uint64)
+        self._ids = np.array([name_id(f"size of {name}") for name in own], dtype=np.uint64)
         self.values: FloatArray = np.tile(NOMINAL, (n, 1))
         """Of every quantity, in its own unit, shape ``(n, len(NAMES))``; nominal where nothing is drawn."""
         self.keys: Keys = np.zeros(n, dtype=np.uint64)
@@ -74,9 +76,9 @@ class Draws:
     def draw(self, ids: IntArray) -> None:
         """Draw for the next episode of the given environments."""
         self.episodes[ids] += 1
-        if not self.names:
+        if not len(self.columns):
             return
-        shares = np.empty((len(ids), len(self.names)))
+        shares = np.empty((len(ids), len(self.columns)))
         _shares(self.keys[ids], self._ids, self.episodes[ids], shares)
         # By the quantity's law: uniform between the ends, or so in its logarithm.
         low, high, nominal = (self._by_law(ends) for ends in (self._low, self._high, NOMINAL[self.columns]))
@@ -133,7 +135,7 @@ class Draws:
 
     def info(self) -> dict[str, FloatArray]:
         """What was drawn, by name, shape ``(n,)`` each; fresh arrays."""
-        return {name: self.values[:, column].copy() for name, column in zip(self.names, self.columns, strict=True)}
+        return {name: self[name].copy() for name in self.names}
 
 
 @dataclass

@@ -126,7 +126,7 @@ class Randomization:
     command_jitter_s: Range = _parameter("s", 0.0, 0.0, 0.2, "command", "step")
     """Largest additional delay, uniform for each command."""
     command_loss: Range = _parameter("1", 0.0, 0.0, 0.9, "command", "step")
-    """Probability that a command does not arrive: the one before stays in force, for half a second at most."""
+    """Probability that losses begin with a command: the one before stays in force, for half a second at most."""
     command_loss_length: Range = _parameter("commands", 1.0, 1.0, 20.0, "command")
     """How many are lost in a row once one is."""
     command_quantum: Range = _parameter("m/s and rad/s", 0.0, 0.0, 0.1, "command")

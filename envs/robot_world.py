@@ -153,16 +153,20 @@ class RobotVectorEnv(NavigationVectorEnv):
 
     def _vary(self, layout: Layout, fixed: dict[str, Any]) -> Layout:
         """The layout of the next episodes: as it is, or with other walls and another size."""
-        varied = self.randomization
+        varied, draws = self.randomization, self._draws
         if not varied.acts_on("layout"):
             return layout
+        if varied.curriculum:
+            varied = varied.scaled(draws.curriculum.strength)
         self._n_layouts += 1
         kept = [(int(fixed[end][0]), int(fixed[end][1])) for end in ("start", "goal") if end in fixed]
-        rng = np.random.default_rng([int(self._draws.keys[0]), self._n_layouts])
+        rng = np.random.default_rng([int(draws.keys[0]), self._n_layouts])
         # Walls: uniform over the whole numbers in the range. Size: uniform.
         n_walls = int(rng.integers(round(varied.obstacles_moved.low), round(varied.obstacles_moved.high) + 1))
-        size = layout.cell_size_m * rng.uniform(varied.cell_size.low, varied.cell_size.high)
-        return replace(layout.with_moved_walls(n_walls, rng, kept=kept), cell_size_m=size)
+        draws["cell_size"][:] = size = rng.uniform(varied.cell_size.low, varied.cell_size.high)
+        moved = layout.with_moved_walls(n_walls, rng, kept=kept)
+        draws["obstacles_moved"][:] = (moved.walls & ~layout.walls).sum()
+        return replace(moved, cell_size_m=layout.cell_size_m * size)
 
     def use_generators(self, generators: list[np.random.Generator]) -> None:
         """Draw from these generators, one per environment; see ``NavigationVectorEnv.use_generators``."""

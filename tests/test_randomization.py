@@ -256,7 +256,8 @@ def test_the_curriculum_begins_with_the_nominal_robot_and_stays_within_its_range
 
     for name in wide.names:
         ends = (getattr(wide, name).low, getattr(wide, name).high, PARAMETERS[name].nominal)
-        assert min(ends) <= draws[name].min() and draws[name].max() <= max(ends), name
+        assert min(ends) <= draws[name].min(), name
+        assert draws[name].max() <= max(ends), name
     # Half of the episodes at full strength, the others anywhere below: a few quantities lie where only these can.
     assert (draws["command_delay_s"] > 0.5 * wide.command_delay_s.high).mean() > 0.25
     assert (draws["command_delay_s"] < wide.command_delay_s.low).mean() > 0.02
@@ -365,7 +366,7 @@ def test_a_state_with_numbers_that_nothing_draws_is_refused() -> None:
         drawn[1, NAMES.index("lidar_delay_s")] = wrong
         with pytest.raises(InputError, match="outside what a randomization may draw"):
             env.set_state(State(arrays | {"imperfections.drawn": drawn}, values))
-    with pytest.raises(InputError, match="cells of 99.0 m in the state are none of 0.5 m"):
+    with pytest.raises(InputError, match=r"cells of 99\.0 m in the state are none of 0\.5 m"):
         env.set_state(State(arrays, {**values, "cell_size_m": 99.0}))
     with pytest.raises(InputError, match="does not fit the randomization"):
         make("Unicycle", "burger", 2, control_period_s=0.1).set_state(State(arrays, values))
@@ -634,7 +635,7 @@ def test_lost_commands_come_in_rows_and_after_half_a_second_of_silence_the_robot
     lost = (in_force != told).any(axis=2)
 
     begins = np.argwhere(lost[1:90] & ~lost[:89])
-    for step, robot in [*begins[:50], 1, 0]:
+    for step, robot in begins[:50] + np.array([1, 0]):
         assert lost[step : step + 4, robot].all()
         # After 0.2 and 0.4 s of silence the last command is in force, after 0.6 and 0.8 s none.
         np.testing.assert_array_equal(in_force[step : step + 2, robot], told[[step - 1] * 2, robot])
@@ -760,7 +761,7 @@ def test_a_slow_lidar_gives_each_scan_as_often_as_it_must() -> None:
         scans.append(env._senses.ranges_m[0].copy())
 
     # Scans are taken at 0, 0.4, 0.8, 1.2 s; at 0.2, 0.4, ... 1.2 s the last of them is seen, noise and all.
-    same = [np.array_equal(one, other) for one, other in itertools.pairwise(scans)]
+    same = [np.allclose(one, other, atol=1e-9) for one, other in itertools.pairwise(scans)]
     assert same == [False, True, False, True, False]
 
 
@@ -867,6 +868,20 @@ def test_the_cells_that_a_reset_names_stay_free() -> None:
         assert env.layout.reachable[8, 8]
 
     assert len(layouts) == 20
+
+
+def test_info_tells_how_the_maze_of_the_batch_varies_and_a_curriculum_begins_with_the_one_there_is() -> None:
+    mazes = {"obstacles_moved": [1, 6], "cell_size": [0.9, 1.1]}
+    env = make("Unicycle", Randomization.load(mazes), 3, layout="classic")
+    for seed in range(5):
+        _, info = env.reset(seed=seed)
+        moved = (env.layout.walls & ~Layout.load("classic").walls).sum()
+        np.testing.assert_array_equal(info["randomization"]["obstacles_moved"], [moved] * 3)
+        np.testing.assert_allclose(info["randomization"]["cell_size"], [env.layout.cell_size_m / 0.5] * 3)
+
+    env = make("Unicycle", Randomization.load({**mazes, "curriculum": True}), 3, layout="classic")
+    env.reset(seed=0)
+    assert env.layout == Layout.load("classic")
 
 
 @pytest.mark.parametrize("world", WORLDS)
