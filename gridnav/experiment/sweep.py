@@ -23,6 +23,8 @@ from gridnav.problem.types import InputError
 
 TABLE, RESULT = "results.csv", "result.json"
 Backend = Literal["local", "ray"]
+ROUND = 8
+"""Trials per job in a round on a cluster, at whose end the table is written."""
 WATCH_S = 0.2
 """How often a worker looks whether its sweep is still alive."""
 
@@ -96,9 +98,10 @@ def carry_out(
     tell()
     left = [one for one in trials if one.number not in outcomes]
     sweeper = os.getpid() if backend == "local" else None
-    work = [joblib.delayed(_attempt)(one, one.folder(sweep), checkpoint_s, sweeper) for one in left]
+    work = [joblib.delayed(_attempt)(one, one.folder(sweep).resolve(), checkpoint_s, sweeper) for one in left]
     with _workers(backend, jobs):
-        for one, outcome in joblib.Parallel(return_as="generator_unordered", batch_size=1)(work):
+        for one, outcome in _results(work, backend, jobs):
+            one.folder(sweep).mkdir(parents=True, exist_ok=True)  # a cluster's machine may have had one of its own
             write_json(one.folder(sweep) / RESULT, vars(outcome))
             outcomes[one.number] = outcome
             tell()
@@ -128,6 +131,16 @@ def _workers(backend: Backend, jobs: int) -> Iterator[None]:
             yield
     except TerminatedWorkerError:
         raise OSError("a worker died, perhaps for want of memory: --resume goes on, with fewer --jobs if so") from None
+
+
+def _results(work: Sequence[Any], backend: Backend, jobs: int) -> Iterator[tuple[Trial, Outcome]]:
+    """What workers give back, as soon as it is there."""
+    if backend == "local":
+        yield from joblib.Parallel(return_as="generator_unordered", batch_size=1)(work)
+        return
+    # Joblib's Ray backend gives nothing back before all is done: in rounds the table grows meanwhile.
+    for begin in range(0, len(work), ROUND * jobs):
+        yield from joblib.Parallel(batch_size=1)(work[begin : begin + ROUND * jobs])
 
 
 def _attempt(one: Trial, folder: Path, checkpoint_s: float, sweeper: int | None) -> tuple[Trial, Outcome]:
