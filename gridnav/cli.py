@@ -201,6 +201,8 @@ class Train(_Run):
         problem, config = self._problem()
         choice = Choice(self.preset, self._changes(), self.observation)
         check_choice(kinds, problem, world, choice)
+        if world == "GridWorld" and problem.randomization.names:
+            raise InputError("--randomization varies robots, and the grid has none: leave it out or give another --env")
         budget = BUDGETS[self.budget]
         with self._directory(f"train-{self.agent}", config) as run, _progress() as on_stage:
             spectator = self._spectator(problem)
