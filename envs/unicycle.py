@@ -14,8 +14,11 @@ from gridnav.problem.types import AnyArray, BoolArray, FloatArray, IntArray
 from .draws import COLUMN, NOMINAL
 from .imperfections import n_remembered
 from .painter import Painter
+from .randomization import PARAMETERS
 from .robot_world import GRAZING, SAME_WALL, RobotEnv, RobotVectorEnv
 
+DRIVE = tuple(name for name, parameter in PARAMETERS.items() if parameter.acts_on == "drive")
+"""Quantities that a robot without motors knows."""
 SUBSTEP_S = 0.01
 """Where a wall is near, contact is looked for this often: a robot at full speed moves 2 mm in it."""
 
@@ -75,7 +78,7 @@ class UnicycleVectorEnv(RobotVectorEnv):
         """
         wheels, draws = self._wheel_fractions(actions), self._draws
         ones = np.ones(self.num_envs)
-        if self.randomization.acts_on("command"):
+        if self._commands.is_active:
             self._told[1:] = self._told[:-1]
             self._told[0] = wheels
             back = np.clip(
@@ -84,7 +87,7 @@ class UnicycleVectorEnv(RobotVectorEnv):
             newer, ids = back.astype(np.int64), np.arange(self.num_envs)
             late = (back - newer)[:, None]
             wheels = (1.0 - late) * self._told[newer, ids] + late * self._told[newer + 1, ids]
-        if not self.randomization.acts_on("drive"):
+        if not draws.varies(*DRIVE):
             return wheels, ones
         # The battery bounds the wheels' speed.
         fastest = draws["battery_v"][:, None] / NOMINAL[COLUMN["battery_v"]]

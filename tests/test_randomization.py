@@ -104,6 +104,14 @@ def test_the_command_line_says_it_in_one_line_and_writes_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_grid_has_nothing_that_varies(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code = run_cli("train", "--agent", "q-learning", "--randomization", "burger", "--run-dir", str(tmp_path / "run"))
+
+    assert code == 2
+    assert "--randomization varies robots, and the grid has none" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_file_changes_a_preset_and_comes_back_from_its_own_json(tmp_path: Path) -> None:
     (tmp_path / "mine.json").write_text('{"preset": "burger", "battery_v": [8, 9], "yaw_inertia": 1}', encoding="utf-8")
 
