@@ -219,21 +219,8 @@ class Train(_Run):
         """Run it."""
         from gridnav.experiment.results import train_and_report
 
-<<<<<<< HEAD
         problem, config = self.checked()
         job = Training.of(config, problem)
-=======
-        kinds = [kind for kind, seen in OBSERVATIONS.items() if self.observation in seen]
-        if self.agent != "all":
-            kinds = [self.agent]
-        world = self.env.split("/")[1].removesuffix("-v0") if self.env else _home(self.agent)
-        problem, config = self._problem()
-        choice = Choice(self.preset, self._changes(), self.observation)
-        check_choice(kinds, problem, world, choice)
-        if world == "GridWorld" and problem.randomization.names:
-            raise InputError("--randomization varies robots, and the grid has none: leave it out or give another --env")
-        budget = BUDGETS[self.budget]
->>>>>>> varied
         with self._directory(f"train-{self.agent}", config) as run, _progress() as on_stage:
             spectator = self._spectator(problem)
             results = train_and_report(

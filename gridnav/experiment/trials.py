@@ -69,6 +69,8 @@ class Training:
         home = "gridnav/DiffDrive-v0" if agent == "ppo" else "gridnav/GridWorld-v0"
         world = config.get("env", home).split("/")[1].removesuffix("-v0")
         check_choice(kinds, problem, world, choice)
+        if world == "GridWorld" and problem.randomization.names:
+            raise InputError("--randomization varies robots, and the grid has none: leave it out or give another --env")
         return cls(problem, BUDGETS[config["budget"]], config["seed"], kinds, world, choice)
 
 
