@@ -174,17 +174,17 @@ def test_a_network_learns_by_heart_what_it_is_shown() -> None:
     rng = np.random.default_rng(0)
     worlds = CORNER.worlds("Unicycle", 1)
     agent = PPOAgent(worlds.single_observation_space, worlds.single_action_space, SMALL)
-    observations = rng.uniform(-1, 1, (3000, 35)).astype(np.float32)
+    observations = rng.uniform(-1, 1, (20_000, 35)).astype(np.float32)
     actions = np.stack([0.5 * observations[:, 30], -0.3 * observations[:, 29]], axis=1)
-    returns = np.where(rng.random(3000) < 0.5, 4.0 * observations[:, 28], np.nan)
+    returns = np.where(rng.random(20_000) < 0.5, 4.0 * observations[:, 28], np.nan)
 
     metrics = clone(agent, Demonstrations(observations, actions, returns))
 
     # By hand: without having learnt anything the error is that of uniform numbers, 0.58 times 0.5 and 0.3: about 0.24.
-    assert metrics["action_error"] < 0.12
-    assert metrics["explained_returns"] > 0.3
-    assert np.corrcoef(agent.act(observations)[:, 0], actions[:, 0])[0, 1] > 0.9
-    assert np.corrcoef(agent.values(observations), observations[:, 28])[0, 1] > 0.9
+    assert metrics["action_error"] < 0.05
+    assert metrics["explained_returns"] > 0.9
+    assert np.corrcoef(agent.act(observations)[:, 0], actions[:, 0])[0, 1] > 0.95
+    assert np.corrcoef(agent.values(observations), observations[:, 28])[0, 1] > 0.95
     assert agent.policy.state_dict()["log_std"].tolist() == [-0.5, -0.5], "how sure one may be was not shown"
 
 
