@@ -333,14 +333,15 @@ class Sweep:
             if not 1 <= finished.episodes <= 100_000:
                 raise InputError(f"--episodes {finished.episodes} is outside 1 to 100000")
             shared = json.loads(json.dumps(asdict(finished)))
-            wish = Wish((), finished.randomization, self.quantities, self.runs, finished.episodes)
+            wish = Wish((), finished.randomization, self.quantities, "", self.runs, finished.episodes)
         else:
             self._leave_out("runs", because="is for the studies one-at-a-time and strength")
             shared = self._shared("ladder" if self.study in ("arms", "default") else "train")
             seeds = (10 if shared["budget"] == "full" else 3) if self.seeds is None else self.seeds
             if not 1 <= seeds <= 1000:
                 raise InputError(f"--seeds {seeds} is outside 1 to 1000")
-            wish = Wish(range(seeds), shared.get("randomization", ""), self.quantities)
+            arms = shared.get("arms") or ""
+            wish = Wish(range(seeds), shared.get("randomization", ""), self.quantities, arms)
         trials = []
         for number, draft in enumerate(plan(self.study, wish)):
             config = draft.fields

@@ -13,6 +13,7 @@ from gridnav.envs import PARAMETERS, RANDOMIZATION_PRESETS, Randomization
 from gridnav.experiment.arms import ARMS
 from gridnav.experiment.design import Settings
 from gridnav.experiment.run_directory import RunDirectory
+from gridnav.experiment.transfer import SCRATCH
 from gridnav.problem.types import InputError
 
 RANDOMIZED = "burger"
@@ -41,6 +42,8 @@ class Wish:
     """A preset, a JSON file or JSON text; the runs' own or ``burger`` by default."""
     quantities: Sequence[str] = ()
     """Of that randomization, or groups of them; all by default."""
+    arms: str = ""
+    """Names of arms of transfer with commas between; all by default."""
     runs: Sequence[Path] = ()
     """Finished runs, where those are evaluated."""
     episodes: int = 200
@@ -65,7 +68,10 @@ class Draft:
 
 
 def _plan_arms(wish: Wish) -> list[Draft]:
-    return [Draft("ladder", {"seed": str(seed)}, {"seed": str(seed), "arms": ",".join(ARMS)}) for seed in wish.seeds]
+    arms = wish.arms or ",".join(ARMS)
+    if SCRATCH not in arms.split(","):
+        raise InputError(f"--arms {arms}: the study compares arms with {SCRATCH}, which is not among them")
+    return [Draft("ladder", {"seed": str(seed)}, {"seed": str(seed), "arms": arms}) for seed in wish.seeds]
 
 
 def _plan_presets(wish: Wish) -> list[Draft]:
