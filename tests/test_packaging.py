@@ -105,7 +105,14 @@ def test_a_wheel_holds_every_module_and_data_file_but_no_stub(tmp_path: Path) ->
 
     expected = {"gridnav/py.typed"}
     for package, folder in SETUPTOOLS["package-dir"].items():
-        for pattern in ["*.py", "mjcf/*.xml", "reality/*.seed", "templates/*.html", "templates/*.css", "templates/*.js"]:
+        for pattern in [
+            "*.py",
+            "mjcf/*.xml",
+            "reality/*.seed",
+            "templates/*.html",
+            "templates/*.css",
+            "templates/*.js",
+        ]:
             files = (ROOT / folder).rglob(pattern)
             expected |= {f"{package.replace('.', '/')}/{file.relative_to(ROOT / folder).as_posix()}" for file in files}
     assert held == expected
