@@ -407,6 +407,8 @@ class Evaluate:
     """Measure what the agents keep of their success in these worlds, which training never sees; test is sealed."""
     report: Path | None = None
     """An .html page for --reality: the question, the answer, a table and a figure."""
+    keep: Path | None = None
+    """A new folder for the episodes in the realities, as a run that view and video show; not of the sealed one."""
 
     def __call__(self) -> int:
         """Run it."""
@@ -426,8 +428,12 @@ class Evaluate:
             raise InputError(f"--figure {str(self.figure)!r} must end with .png or .svg")
         if self.report is not None:
             _check_ending("--report", self.report, ".html")
-        if bool(self.report) > bool(self.reality) or (self.reality and (self.randomization or self.figure)):
-            raise InputError("--report goes with --reality; --randomization and --figure do not")
+        if (self.report or self.keep) and not self.reality:
+            raise InputError("--report and --keep go with --reality: say which")
+        if self.reality and (self.randomization or self.figure or self.seed is not None):
+            raise InputError("--randomization, --figure and --seed do not go with --reality: leave them out")
+        if self.keep is not None:
+            RunDirectory(self.keep).check_free()
         runs = [RunDirectory.open(path) for path in self.runs]
         if self.reality:
             return self._measure_gaps(runs)
@@ -455,10 +461,16 @@ class Evaluate:
         """Every agent at home and in the realities."""
         from gridnav.experiment import sim_to_real
 
+        episodes: list[tuple[Problem, Result]] = []
         with _progress() as on_stage:
-            gaps = sim_to_real.measure(runs, self.reality, self.episodes, on_stage)
+            gaps = sim_to_real.measure(
+                runs, self.reality, self.episodes, on_stage, on_episodes=lambda *one: episodes.append(one)
+            )
         if not gaps:
             raise InputError("none of the runs has an agent that drives a robot")
+        if self.keep is not None and episodes:
+            asked = {"runs": [str(path) for path in self.runs], "reality": self.reality, "episodes": self.episodes}
+            sim_to_real.keep(self.keep, episodes, {"command": "evaluate", **asked})
         if self.output is not None:
             write_json(self.output, sim_to_real.as_json(gaps))
         if self.report is not None:

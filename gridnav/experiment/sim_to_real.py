@@ -19,12 +19,12 @@ from gridnav.envs import Randomization
 from gridnav.experiment.checkpoint import load_agent
 from gridnav.experiment.evaluation import evaluate_in
 from gridnav.experiment.reality import WORLD, Reality, find_reality
-from gridnav.experiment.results import stored_evaluation
+from gridnav.experiment.results import stored_evaluation, write_evaluation, write_rollouts
 from gridnav.experiment.run_directory import RunDirectory, read_json, write_json
-from gridnav.experiment.training import OnStage
+from gridnav.experiment.training import OnStage, Result
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.metrics import Summary, summarise
-from gridnav.problem.types import FloatArray
+from gridnav.problem.types import FloatArray, InputError
 
 MEASURED = "realities.json"
 """In a run: what ``measure_once`` found."""
@@ -34,6 +34,9 @@ DRAWS = 10_000
 """Resamplings for intervals; their seed is fixed."""
 ENOUGH_POLICIES = 8
 """Of fewer policies a correlation says little."""
+MOST_SHOWN = 3
+"""Agents side by side in the recording of ``keep``."""
+OnEpisodes = Callable[[Problem, Result], None]
 TITLE = "From simulation to reality"
 QUESTION = "What do policies keep of their success in worlds that training never saw?"
 COLUMNS = ("policy", "world", "success", "kept", "SPL", "collided")
@@ -89,7 +92,7 @@ def measure(
     episodes: int,
     on_stage: OnStage,
     *,
-    policies: Sequence[str] = (),
+    on_episodes: OnEpisodes | None = None,
 ) -> list[Gap]:
     """Every policy of some runs that drives robots, at home and in realities.
 
@@ -98,7 +101,7 @@ def measure(
         realities: Names.
         episodes: Of each policy in each world, the same ones everywhere.
         on_stage: Told of every evaluation.
-        policies: Names of those rows of the runs' evaluations that are measured; all of the robot's by default.
+        on_episodes: Given the episodes in each reality that is not sealed, with the problem they are of.
 
     Raises:
         InputError: When a reality is unknown, or a run is not whole.
@@ -108,14 +111,19 @@ def measure(
     for run in runs:
         problem, rows = stored_evaluation(run)
         for name, row in rows.items():
-            if row["world"] == "GridWorld" or (policies and name not in policies):
+            if row["world"] == "GridWorld":
                 continue
             if row["world"] != WORLD and any(one["world"] == WORLD for one in rows.values()):
                 continue  # the same agent on the robot has a row of its own
             agent = load_agent(run.checkpoints, row["checkpoint"])
             label = name if len(runs) == 1 else f"{run.path.name} {name}"
             home = replace(problem, randomization=Randomization.load(row["randomization"]))
-            gaps.append(_gap(label, run, home, agent, row["world"], worlds, episodes, on_stage))
+            report = on_stage(f"{label} at home")
+            at_home = summarise(evaluate_in(home, agent, row["world"], episodes, on_progress=report))
+            away = {}
+            for reality in worlds:
+                away[reality.name] = _away(label, run, home, agent, reality, episodes, on_stage, on_episodes)
+            gaps.append(Gap(label, at_home, away))
     return gaps
 
 
@@ -151,24 +159,45 @@ def _summary(stored: Mapping[str, Any]) -> Summary:
     return Summary(**values)
 
 
-def _gap(
+def _away(
     label: str,
     run: RunDirectory,
     problem: Problem,
     agent: Agent,
-    home: str,
-    worlds: Sequence[Reality],
-    episodes: int,
+    reality: Reality,
+    n_episodes: int,
     on_stage: OnStage,
-) -> Gap:
-    at_home = summarise(evaluate_in(problem, agent, home, episodes, on_progress=on_stage(f"{label} at home")))
-    away = {}
-    for reality in worlds:
-        report = on_stage(f"{label} in {reality.name}")
-        away[reality.name] = reality.measure(problem, agent, episodes, on_progress=report)
-        if reality.is_sealed:
-            _log(run, label, away[reality.name])
-    return Gap(label, at_home, away)
+    on_episodes: OnEpisodes | None,
+) -> Summary:
+    report = on_stage(f"{label} in {reality.name}")
+    if reality.is_sealed:
+        summary = reality.measure(problem, agent, n_episodes, on_progress=report)
+        _log(run, label, summary)
+        return summary
+    episodes = reality.episodes(problem, agent, n_episodes, on_progress=report)
+    if on_episodes is not None:
+        name = f"{label}-{reality.name}".replace(" ", "-")
+        on_episodes(problem, Result(name, WORLD, f"{label} in {reality.name}", "", "", episodes))
+    return summarise(episodes)
+
+
+def keep(path: Path, episodes: Sequence[tuple[Problem, Result]], config: Mapping[str, Any]) -> None:
+    """Episodes in realities as a run that ``gridnav view`` and ``gridnav video`` show.
+
+    Args:
+        path: The run's folder, which must not exist or be empty.
+        episodes: What ``measure`` gave to ``on_episodes``.
+        config: What was asked for.
+
+    Raises:
+        InputError: When the folder is taken, or the episodes are in several mazes.
+    """
+    problem, results = episodes[0][0], [result for _, result in episodes]
+    if any(other.layout != problem.layout for other, _ in episodes):
+        raise InputError("--keep takes runs of one maze: their episodes are shown in it")
+    with RunDirectory.create(path, "realities", config) as run:
+        write_evaluation(run, results, 0)
+        write_rollouts(run, problem, results, results[-MOST_SHOWN:], {})
 
 
 def _log(run: RunDirectory, policy: str, summary: Summary) -> None:
