@@ -36,7 +36,7 @@ from gridnav.display.viewer import ViewerError
 from gridnav.envs import RANDOMIZATION_PRESETS, RenderingError
 from gridnav.experiment.checkpoint import clear_leftovers
 from gridnav.experiment.course import CHECKPOINT_S
-from gridnav.experiment.run_directory import CONFIG, RunDirectory, read_json, write_json
+from gridnav.experiment.run_directory import CONFIG, RESULT, RunDirectory, read_json, write_json
 from gridnav.experiment.training import BUDGETS, BudgetName, OnStage, Result
 from gridnav.experiment.trials import Training
 from gridnav.experiment.worlds import RANDOM, Problem
@@ -549,9 +549,9 @@ class View(_Episodes):
         pick = Pick(self.episode, self.worst, self.failed)
         if self.overlay and pick.is_given:
             raise InputError("--overlay shows all episodes: leave --episode, --worst and --failed out")
-        recording = runs[0].recording
-        is_there = recording.is_file() or not runs[0].rollouts.is_dir()  # trials of a sweep have rollouts alone
-        if len(runs) == 1 and is_there and not (pick.is_given or self.rollouts or self.overlay):
+        is_trial = (runs[0].path / RESULT).is_file()  # of a sweep: it has rollouts alone
+        if len(runs) == 1 and not (pick.is_given or self.rollouts or self.overlay or is_trial):
+            recording = runs[0].recording
             if not recording.is_file():
                 raise InputError(f"{str(self.run)!r} has no {recording.name}: the run has not finished")
             check_recording(recording)

@@ -30,6 +30,8 @@ CONFIG, METRICS, EVALUATION, REPORT, RECORDING = (
 )
 
 
+RESULT = "result.json"
+"""What came of a sweep's trial; other runs have none."""
 LOCK, OWNER = ".lock", ".owner"
 
 

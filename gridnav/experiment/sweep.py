@@ -17,11 +17,11 @@ from typing import Any, Literal
 import joblib
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-from gridnav.experiment.run_directory import RunDirectory, read_json, write_json, write_whole
+from gridnav.experiment.run_directory import RESULT, RunDirectory, read_json, write_json, write_whole
 from gridnav.experiment.trials import Row, check_config, trial
 from gridnav.problem.types import InputError
 
-TABLE, RESULT = "results.csv", "result.json"
+TABLE = "results.csv"
 Backend = Literal["local", "ray"]
 ROUND = 8
 """Trials per job in a round on a cluster, at whose end the table is written."""
