@@ -581,8 +581,8 @@ def _counted(n: int, what: str) -> str:
 
 
 def _plain(text: str) -> str:
-    """Text on one line."""
-    return " ".join(text.split())
+    """Text on one line, without what would end a table's cell."""
+    return " ".join(text.split()).replace("|", "/")
 
 
 # ---- The arrangement ---------------------------------------------------------------------------
