@@ -1063,11 +1063,14 @@ SHOWN_TRIALS = 60
 
 def _show_sweep(trials: Sequence[Trial], outcomes: Sequence[Outcome]) -> None:
     settings = list(trials[0].settings)
-    table = Table("trial", *settings, "agent", "success (95 % interval)", "SPL", "SCT", "collided", "steps")
+    is_elsewhere = any("under" in row for outcome in outcomes for row in outcome.rows)
+    columns = (*settings, *(["tested under"] if is_elsewhere else []))
+    table = Table("trial", *columns, "agent", "success (95 % interval)", "SPL", "SCT", "collided", "steps")
     for one, outcome in zip(trials, outcomes, strict=True):
         for row in outcome.rows:
             table.add_row(
-                str(one.number), *(one.settings[name] for name in settings), row["name"],
+                str(one.number), *(one.settings[name] for name in settings),
+                *([str(row.get("under", ""))] if is_elsewhere else []), row["name"],
                 _share(row["success"], (row["success_low"], row["success_high"])), f"{row['spl']:.2f}",
                 f"{row['sct']:.2f}", f"{row['collided']:.1%}", f"{row['steps']:,}",
             )  # fmt: skip
