@@ -72,7 +72,7 @@ class Gap:
 
 @dataclass(frozen=True)
 class Correlation:
-    """How well success at home foretells success in a reality, over policies (SRCC, Kadian et al. 2020)."""
+    """How well success in one world foretells success in a reality, over policies (SRCC, Kadian et al. 2020)."""
 
     n_policies: int
     """How many."""
@@ -217,9 +217,13 @@ def sealed_evaluations(run: RunDirectory) -> int:
     return len(log.read_text(encoding="utf-8").splitlines()) if log.is_file() else 0
 
 
-def correlation(gaps: Sequence[Gap], reality: str) -> Correlation:
-    """Between success at home and in a reality, over at least two policies."""
-    pairs = np.array([[gap.at_home.success_rate, gap.away[reality].success_rate] for gap in gaps])
+def home_and_away(gaps: Sequence[Gap], reality: str) -> FloatArray:
+    """Success at home and in a reality, shape ``(n_policies, 2)``."""
+    return np.array([[gap.at_home.success_rate, gap.away[reality].success_rate] for gap in gaps])
+
+
+def correlation(pairs: FloatArray) -> Correlation:
+    """Between success in one world and in a reality, of at least two policies, shape ``(n_policies, 2)``."""
     rng = np.random.default_rng(0)
     # Policies: uniform with replacement, so many as there are.
     picked = pairs[rng.integers(len(pairs), size=(DRAWS, len(pairs)))]
@@ -269,7 +273,7 @@ def as_json(gaps: Sequence[Gap]) -> dict[str, Any]:
             for gap in gaps
         },
         "correlation": {
-            name: {key: _known(value) for key, value in asdict(correlation(gaps, name)).items()}
+            name: {key: _known(value) for key, value in asdict(correlation(home_and_away(gaps, name))).items()}
             for name in names
             if len(gaps) > 1
         },
@@ -294,7 +298,7 @@ def conclusion(gaps: Sequence[Gap]) -> str:
             f"({worst.at_home.success_rate:.1%})"
         )
         if len(gaps) > 1:
-            found = correlation(gaps, name)
+            found = correlation(home_and_away(gaps, name))
             low, high = found.pearson_interval
             words += f"; over {found.n_policies} policies success at home and there correlate by {found.pearson:.2f} "
             words += f"({low:.2f} to {high:.2f}{'' if found.n_policies >= ENOUGH_POLICIES else '; too few to rely on'})"
