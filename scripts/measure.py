@@ -9,6 +9,7 @@ python scripts/measure.py ppo-layouts [SEED ...]    PPO on random layouts: train
 python scripts/measure.py ppo-warm [SEED ...]       PPO on DiffDrive, warm-started from the Unicycle
 python scripts/measure.py ppo-settings [SEED ...]   PPO's environments, rollout, batch, epochs and network compared
 python scripts/measure.py sac [SEED ...]            SAC of stable-baselines3 on DiffDrive, success against time
+python scripts/measure.py randomization             what randomising 256 DiffDrives costs, by preset and by quantity
 """
 
 import sys
@@ -22,6 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from gridnav.agents import Planner, QLearning
+from gridnav.envs import RANDOMIZATION_PRESETS, Randomization
 from gridnav.experiment.evaluation import evaluate, policy_for
 from gridnav.experiment.ladder import steps_to
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
@@ -179,6 +181,30 @@ def sac(seeds: Sequence[int]) -> None:
         model.learn(10_000_000, callback=Clock())
 
 
+def randomization(num_envs: int = 256, rounds: int = 9, steps: int = 20) -> None:
+    """Steps per second of processor time against those without randomisation; the cases take turns."""
+    burger = Randomization.load("burger")
+    caster = burger.only("caster_friction")
+    cases = {name: Randomization.load(name) for name in RANDOMIZATION_PRESETS if name != "curriculum"}
+    cases |= {"burger without caster_friction": burger.without("caster_friction"), "caster_friction alone": caster}
+    worlds = {name: PROBLEM.worlds("DiffDrive", num_envs, randomization=one) for name, one in cases.items()}
+    rng, taken = np.random.default_rng(0), {name: [] for name in cases}
+    for one in worlds.values():
+        one.reset(seed=0)
+    for _ in range(rounds + 1):
+        actions = np.clip(rng.uniform(-0.6, 1.4, (steps, num_envs, 2)), -1.0, 1.0)
+        for name, one in worlds.items():
+            began = time.process_time()
+            for action in actions:
+                one.step(action)
+            taken[name].append(time.process_time() - began)
+    # The first round compiles and warms up.
+    base = np.array(taken["none"][1:])
+    for name, seconds in taken.items():
+        ratios = base / np.array(seconds[1:])
+        print(f"{name}: {np.median(ratios):.2f} ({ratios.min():.2f} to {ratios.max():.2f})", flush=True)
+
+
 def ppo_settings(seeds: Sequence[int]) -> None:
     """Each setting with each seed: speed, steps to a training success of 95 %, and what the greedy policy achieves."""
     from gridnav.agents import PPOAgent, PPOConfig
@@ -245,6 +271,8 @@ if __name__ == "__main__":
         ppo_warm(seeds or range(3))
     elif what == "ppo-settings":
         ppo_settings(seeds or range(3))
+    elif what == "randomization":
+        randomization()
     elif what == "sac":
         sac(seeds or range(2))
     else:
