@@ -252,12 +252,12 @@ def _log_drawn(recording: rr.RecordingStream, rollouts: Mapping[str, Episode], u
         return
     drawn = {name: episode.randomization for name, episode in rollouts.items() if episode.randomization}
     lines = [
-        f"| quantity | {' | '.join(_plain(name) for name in drawn)} | unit |",
+        f"| quantity | {' | '.join(_in_cell(name) for name in drawn)} | unit |",
         f"| --- |{' ---: |' * len(drawn)} --- |",
     ]
     for quantity in dict.fromkeys(name for values in drawn.values() for name in values):
         values = [f"{values[quantity]:.4g}" if quantity in values else "" for values in drawn.values()]
-        lines.append(f"| {_plain(quantity)} | {' | '.join(values)} | {_plain(units.get(quantity, ''))} |")
+        lines.append(f"| {_in_cell(quantity)} | {' | '.join(values)} | {_in_cell(units.get(quantity, ''))} |")
     recording.log("drawn", rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN), static=True)
 
 
@@ -581,8 +581,13 @@ def _counted(n: int, what: str) -> str:
 
 
 def _plain(text: str) -> str:
-    """Text on one line, without what would end a table's cell."""
-    return " ".join(text.split()).replace("|", "/")
+    """Text on one line."""
+    return " ".join(text.split())
+
+
+def _in_cell(text: str) -> str:
+    """The same without what would end a table's cell."""
+    return _plain(text).replace("|", "/")
 
 
 # ---- The arrangement ---------------------------------------------------------------------------

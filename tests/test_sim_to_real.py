@@ -1,0 +1,87 @@
+"""What policies keep of their success in held-out worlds: the numbers, the command, the log of the sealed one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import run_cli
+
+from gridnav.agents import Planner
+from gridnav.experiment.checkpoint import save_agent
+from gridnav.experiment.rollouts import load_rollouts, names
+from gridnav.experiment.run_directory import RunDirectory, write_json
+from gridnav.experiment.sim_to_real import SEALED_LOG, correlation
+from gridnav.experiment.worlds import Problem
+
+CORRIDOR = "S..G\n"
+
+
+def plan_run(path: Path) -> Path:
+    """A run whose one agent is a plan that drives the robot."""
+    problem = Problem.load(CORRIDOR, "default", "default")
+    plan = Planner.solve(problem.layout, problem.task, problem.reward)
+    config = {"command": "train", "layout": CORRIDOR, "task": "default", "reward": "default", "seed": 0}
+    row = {"world": "DiffDrive", "agent": "plan", "carried": "", "checkpoint": "plan", "observation": "cell_goal"}
+    with RunDirectory.create(path, "plan", config) as run:
+        save_agent(plan, run.checkpoints, 0, name="plan")
+        write_json(run.evaluation, {"results": {"plan": row | {"training_steps": 0, "training_seconds": 0.0}}})
+    return path
+
+
+def test_correlation_of_success_by_hand() -> None:
+    # By hand: deviations from the means 0.5 and 0.6 are (-0.5, 0, 0.5) and (-0.4, 0.2, 0.2), so the correlation is
+    # (0.2 + 0.1) / sqrt(0.5 * 0.24) = 0.866; of the ranks (1, 2, 3) and (1, 2.5, 2.5) 1.5 / sqrt(2 * 1.5) = 0.866.
+    found = correlation(np.array([[0.0, 0.2], [0.5, 0.8], [1.0, 0.8]]))
+
+    assert found.n_policies == 3
+    assert found.pearson == pytest.approx(0.3 / np.sqrt(0.12))
+    assert found.spearman == pytest.approx(1.5 / np.sqrt(3.0))
+    assert found.pearson_interval[0] <= found.pearson <= found.pearson_interval[1] + 1e-9
+
+
+def test_policies_that_are_equal_at_home_foretell_nothing() -> None:
+    found = correlation(np.array([[1.0, 0.2], [1.0, 0.8], [1.0, 0.5]]))
+
+    assert np.isnan(found.pearson)
+    assert np.isnan(found.pearson_interval).all()
+
+
+def test_evaluate_reality_measures_reports_keeps_and_counts(tmp_path: Path) -> None:
+    run, page, kept = plan_run(tmp_path / "plan"), tmp_path / "gap.html", tmp_path / "kept"
+    asked = ("evaluate", str(run), "--reality", "structural", "test", "--episodes", "4")
+
+    code = run_cli(*asked, "--output", str(tmp_path / "gap.json"), "--report", str(page), "--keep", str(kept))
+
+    assert code == 0
+    found = json.loads((tmp_path / "gap.json").read_text())["policies"]["plan"]
+    assert found["home"]["success_rate"] == 1.0
+    assert set(found) == {"home", "structural", "test", "retention"}
+    assert found["retention"]["structural"][0] == found["structural"]["success_rate"]
+    assert "All realities are simulations" in page.read_text()
+    # The sealed one is logged, and its episodes are nowhere.
+    assert names(kept / "rollouts") == ["plan-structural"]
+    assert len(load_rollouts(kept / "rollouts", "plan-structural").episodes) == 4
+    assert len((run / SEALED_LOG).read_text().splitlines()) == 1
+    assert run_cli("view", str(kept), "--save", str(tmp_path / "kept.rrd")) == 0
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (("--keep", "kept"), "--report and --keep go with --reality"),
+        (("--reality", "structural", "--seed", "3"), "do not go with --reality"),
+        (("--reality", "moon"), "moon"),
+    ],
+)
+def test_what_does_not_go_together_is_one_line(
+    flags: tuple[str, ...], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = plan_run(tmp_path / "plan")
+
+    assert run_cli("evaluate", str(run), *flags) == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count("\n") == 1
