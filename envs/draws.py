@@ -40,6 +40,12 @@ STEP = 0.1
 """Of the strength, at each decision."""
 
 
+def wheel_factors(ratio: FloatArray) -> FloatArray:
+    """Radius of the left and the right wheel over their mean, shape ``(n, 2)``, given right over left, ``(n,)``."""
+    factors: FloatArray = np.stack([2.0 / (1.0 + ratio), 2.0 * ratio / (1.0 + ratio)], axis=1)
+    return factors
+
+
 class Draws:
     """What each of ``n`` environments has drawn for its episode.
 

@@ -41,12 +41,10 @@ def steer(poses: FloatArray, targets_w: FloatArray, robot: Robot, period_s: floa
     Returns:
         Forward and turning speed as fractions of the maxima, shape ``(n, 2)``.
     """
-    gap = targets_w - poses[:, :2]
-    error = np.arctan2(gap[:, 1], gap[:, 0]) - poses[:, 2]
-    error = (error + np.pi) % (2.0 * np.pi) - np.pi
+    distance_m, error = _towards(poses, targets_w)
     # What would close each gap within the period; half speed when turning keeps the wheels from slipping.
     turn = np.clip(error / (period_s * robot.max_turn_rad_s), -0.5, 0.5)
-    forward = np.clip(np.hypot(gap[:, 0], gap[:, 1]) / (period_s * robot.max_speed_m_s), 0.0, 1.0)
+    forward = np.clip(distance_m / (period_s * robot.max_speed_m_s), 0.0, 1.0)
     facing = np.abs(error) < FACING_RAD
     # The faster wheel has no more than full speed to give to both.
     forward = np.where(facing, np.minimum(forward, 1.0 - np.abs(turn)), 0.0)
@@ -67,13 +65,18 @@ def glide(poses: FloatArray, targets_w: FloatArray, robot: Robot, period_s: floa
     Returns:
         Forward and turning speed as fractions of the maxima, shape ``(n, 2)``.
     """
-    gap = targets_w - poses[:, :2]
-    error = np.arctan2(gap[:, 1], gap[:, 0]) - poses[:, 2]
-    error = (error + np.pi) % (2.0 * np.pi) - np.pi
+    distance_m, error = _towards(poses, targets_w)
     turn = 0.5 * np.tanh(error / TURNING_RAD)
-    near = np.clip(np.hypot(gap[:, 0], gap[:, 1]) / (period_s * robot.max_speed_m_s), 0.0, 1.0)
+    near = np.clip(distance_m / (period_s * robot.max_speed_m_s), 0.0, 1.0)
     forward = near * (1.0 - np.abs(turn)) * np.exp(-((error / SLOWING_RAD) ** 2))
     return np.stack([forward, turn], axis=1)
+
+
+def _towards(poses: FloatArray, targets_w: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Distance to each target in metres, and its direction off the heading in radians, in [-pi, pi)."""
+    gap = targets_w - poses[:, :2]
+    error = np.arctan2(gap[:, 1], gap[:, 0]) - poses[:, 2]
+    return np.hypot(gap[:, 0], gap[:, 1]), (error + np.pi) % (2.0 * np.pi) - np.pi
 
 
 def lead(poses: FloatArray, moves: IntArray, layout: Layout) -> FloatArray:
@@ -205,14 +208,12 @@ class GridMoves(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if self._mode == "features":
             return observation
         worlds = self._robot_env.worlds
-        row, col = info["cell"]
-        cell = row * worlds.layout.n_cols + col
         if self._mode == "cell":
-            return cell
-        rank = np.flatnonzero((worlds.goal_cells == worlds._goal[0]).all(axis=1))
-        if rank.size == 0:
+            row, col = info["cell"]
+            return row * worlds.layout.n_cols + col
+        if worlds.goal_ranks[tuple(worlds._goal[0])] < 0:
             raise InputError(
                 f"goal {tuple(worlds._goal[0].tolist())} is no goal of this task, which cell_goal observations cannot "
                 'name: use task="any" or observation="features"'
             )
-        return cell * len(worlds.goal_cells) + int(rank[0])
+        return int(worlds.cell_goal(worlds._cell, worlds._goal)[0])

@@ -64,10 +64,7 @@ class GridWorldVectorEnv(NavigationVectorEnv):
         self._cells = np.stack(np.divmod(np.arange(self.layout.n_cells), self.layout.n_cols), axis=1)
         self._centres = self.layout.to_metres(self._cells)
         self._position = np.zeros(self.num_envs, dtype=np.int64)  # number of the cell, row by row
-        # Place of each cell among the goals, -1 where it is none.
         self._n_goals = len(self.goal_cells)
-        self._goal_rank = np.full(self.layout.n_cells, -1)
-        self._goal_rank[self._numbers(self.goal_cells)] = np.arange(self._n_goals)
         # Moves from all cells to each goal met so far, and which row of them is a cell's (-1 for none).
         self._moves_to_goal: NDArray[np.uint16] = np.empty((0, self.layout.n_cells), dtype=np.uint16)
         self._row_of_cell = np.full(self.layout.n_cells, -1)
@@ -104,7 +101,7 @@ class GridWorldVectorEnv(NavigationVectorEnv):
             goals,
             self.layout.n_cols,
             self._row_of_cell,
-            self._goal_rank,
+            self.goal_ranks.ravel(),
             self._moves_to_goal,
             self._position,
             self._goal_number,

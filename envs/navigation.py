@@ -150,6 +150,8 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         self._features = FeatureVector(self.layout, self.robot)
         self._lidar = Lidar(self.layout, self.robot)
         self._sampler = EpisodeSampler(self.task, self.layout)
+        self.goal_ranks = self.task.goal_ranks(self.layout)
+        """Place of each cell among ``goal_cells``, -1 where it is none, shape ``(n_rows, n_cols)``."""
         self._transition.duration[:] = self.step_duration
 
     @abstractmethod
@@ -310,6 +312,20 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
     def goal_cells(self) -> IntArray:
         """Goals an episode may have, (row, column), shape ``(n_goals, 2)``, in the order of ``cell_goal``."""
         return self.task.goal_cells(self.layout)
+
+    def cell_goal(self, cells: IntArray, goals: IntArray) -> IntArray:
+        """What robots on the grid would observe there.
+
+        Args:
+            cells: Where they are, (row, column), shape ``(n, 2)``.
+            goals: Where they are to go, shape ``(n, 2)``; what is no goal of the task counts as its first one.
+
+        Returns:
+            ``cell * n_goals + goal``, shape ``(n,)``.
+        """
+        ranks = np.maximum(self.goal_ranks[tuple(goals.T)], 0)
+        numbers: IntArray = (cells[:, 0] * self.layout.n_cols + cells[:, 1]) * len(self.goal_cells) + ranks
+        return numbers
 
     # ---- Episodes ----------------------------------------------------------------------------
 

@@ -10,7 +10,7 @@ from mujoco.batch import Batch
 
 from gridnav.problem.types import FloatArray, IntArray
 
-from .draws import Draws
+from .draws import Draws, wheel_factors
 
 LAG_TO_ARMATURE = 0.5
 """Rotor inertia, kg m^2, that makes 63 % of a small step take a second longer; measured, and linear."""
@@ -75,9 +75,9 @@ class Physics:
             moved = np.stack([of(f"centre_{axis}_m", ids) for axis in "xyz"], axis=1)
             self._field("body_ipos")[ids, base] = model.body_ipos[base] + moved
         if self._varies("wheel_radius", "wheel_radius_ratio"):
-            ratio, both = of("wheel_radius_ratio", ids), of("wheel_radius", ids)
-            for geom, factor in zip(self._geoms, (2.0 / (1.0 + ratio), 2.0 * ratio / (1.0 + ratio)), strict=True):
-                self._field("geom_size")[ids, geom, 0] = model.geom_size[geom, 0] * both * factor
+            factors = wheel_factors(of("wheel_radius_ratio", ids))
+            for geom, factor in zip(self._geoms, factors.T, strict=True):
+                self._field("geom_size")[ids, geom, 0] = model.geom_size[geom, 0] * of("wheel_radius", ids) * factor
         if self._varies("wheel_separation"):
             for body in self._wheels:
                 self._field("body_pos")[ids, body, 1] = model.body_pos[body, 1] * of("wheel_separation", ids)

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 from gridnav.problem.geodesic import clearance
 from gridnav.problem.types import AnyArray, BoolArray, FloatArray, IntArray
 
-from .draws import COLUMN, NOMINAL
+from .draws import COLUMN, NOMINAL, wheel_factors
 from .imperfections import n_remembered
 from .painter import Painter
 from .randomization import PARAMETERS
@@ -91,8 +91,7 @@ class UnicycleVectorEnv(RobotVectorEnv):
             return wheels, ones
         # The battery bounds the wheels' speed.
         fastest = draws["battery_v"][:, None] / NOMINAL[COLUMN["battery_v"]]
-        ratio = draws["wheel_radius_ratio"]
-        radius = np.stack([2.0 / (1.0 + ratio), 2.0 * ratio / (1.0 + ratio)], axis=1) * draws["wheel_radius"][:, None]
+        radius = wheel_factors(draws["wheel_radius_ratio"]) * draws["wheel_radius"][:, None]
         return np.clip(wheels, -fastest, fastest) * radius, 1.0 / draws["wheel_separation"]
 
     def render(self) -> tuple[Any, ...] | None:

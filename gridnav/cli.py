@@ -37,8 +37,7 @@ from gridnav.envs import RANDOMIZATION_PRESETS, RenderingError
 from gridnav.experiment.checkpoint import clear_leftovers
 from gridnav.experiment.course import CHECKPOINT_S
 from gridnav.experiment.run_directory import CONFIG, RESULT, RunDirectory, read_json, write_json
-from gridnav.experiment.training import BUDGETS, BudgetName, OnStage, Result
-from gridnav.experiment.trials import Training
+from gridnav.experiment.training import BUDGETS, BudgetName, Job, OnStage, Result, Training
 from gridnav.experiment.worlds import RANDOM, Problem
 from gridnav.problem.layout import NAMED_LAYOUTS, Layout
 from gridnav.problem.reward import Reward
@@ -47,6 +46,7 @@ from gridnav.problem.types import InputError, NonFiniteError
 
 if TYPE_CHECKING:
     from gridnav.experiment.across_seeds import AcrossSeeds
+    from gridnav.experiment.arms import Arm
     from gridnav.experiment.live import Spectator
     from gridnav.experiment.sweep import Outcome, Trial
 
@@ -122,6 +122,13 @@ class _Run:
 
         return Spectator(problem, address_of(self.live_port or open_empty_window()), self.live_s)
 
+    def _job(self, problem: Problem, config: Mapping[str, Any], run: RunDirectory, on_stage: OnStage) -> Job:
+        """What is to be made, with the spectator's window open."""
+        return Job(
+            problem, BUDGETS[self.budget], self.seed, run, on_stage, config, _again(run), self.checkpoint_s,
+            self._spectator(problem),
+        )  # fmt: skip
+
     def _directory(self, name: str, config: dict[str, Any]) -> contextlib.AbstractContextManager[RunDirectory]:
         return _directory(self.run_dir, self.resume, name, config)
 
@@ -161,9 +168,7 @@ class Ladder(_Run):
 
     def checked(self) -> tuple[Problem, dict[str, Any]]:
         """The problem, and the configuration as JSON values that need no other file, once all is known to be right."""
-        from gridnav.experiment.arms import choose_arms
-
-        arms = choose_arms(self.arms) if self.arms is not None else {}
+        arms = self._arms()
         problem, config = self._problem()
         if problem.family is not None:
             raise InputError(
@@ -178,20 +183,21 @@ class Ladder(_Run):
 
     def __call__(self) -> int:
         """Run it."""
-        from gridnav.experiment.arms import choose_arms
         from gridnav.experiment.ladder import climb, compare
 
         problem, config = self.checked()
-        arms = choose_arms(self.arms) if self.arms is not None else {}
-        budget = BUDGETS[self.budget]
+        arms = self._arms()
         with self._directory("ladder", config) as run, _progress() as on_stage:
-            how: dict[str, Any] = {"checkpoint_s": self.checkpoint_s, "spectator": self._spectator(problem)}
-            if arms:
-                results = compare(problem, budget, self.seed, arms, run, _again(run), config, on_stage, **how)
-            else:
-                results = climb(problem, budget, self.seed, run, _again(run), config, on_stage, **how)
+            job = self._job(problem, config, run, on_stage)
+            results = compare(job, arms) if arms else climb(job)
         _show(results, run)
         return 0
+
+    def _arms(self) -> dict[str, Arm]:
+        """The arms to compare, if any are."""
+        from gridnav.experiment.arms import choose_arms
+
+        return choose_arms(self.arms) if self.arms is not None else {}
 
 
 @dataclass(frozen=True)
@@ -220,13 +226,9 @@ class Train(_Run):
         from gridnav.experiment.results import train_and_report
 
         problem, config = self.checked()
-        job = Training.of(config, problem)
+        training = Training.of(config, problem)
         with self._directory(f"train-{self.agent}", config) as run, _progress() as on_stage:
-            spectator = self._spectator(problem)
-            results = train_and_report(
-                problem, job.budget, self.seed, job.kinds, job.world, job.choice, run, _again(run), config, on_stage,
-                checkpoint_s=self.checkpoint_s, spectator=spectator,
-            )  # fmt: skip
+            results = train_and_report(self._job(problem, config, run, on_stage), training)
         _show(results, run)
         return 0
 
@@ -278,7 +280,8 @@ class Sweep:
 
     def __call__(self) -> int:
         """Run it."""
-        from gridnav.experiment.sweep import TABLE, carry_out, check_backend
+        from gridnav.experiment.sweep import TABLE, carry_out
+        from gridnav.experiment.workers import check_backend
 
         jobs = cpu_count() if self.jobs is None else self.jobs
         if not 1 <= jobs <= 1024:
@@ -298,7 +301,9 @@ class Sweep:
             from gridnav.experiment.findings import write_study
 
             with _progress() as on_stage:
-                sentence = write_study(self.study, trials, outcomes, run, on_stage, command=_again(run), config=config)
+                sentence = write_study(
+                    self.study, trials, outcomes, run, on_stage, jobs=jobs, command=_again(run), config=config
+                )
             stdout.print(f"report     {run.report}\n{sentence}", markup=False)
         return 0
 
@@ -348,7 +353,8 @@ class Sweep:
             if not evaluates:
                 names = {field.name for field in fields(COMMANDS[draft.command])}  # type: ignore[arg-type]
                 own = {key: value for key, value in shared.items() if key in names}
-                config = _checked(draft.command, {**own, **draft.fields})
+                changes = [*own.get("set", ()), *draft.fields.get("set", ())]
+                config = _checked(draft.command, {**own, **draft.fields, **({"set": changes} if changes else {})})
             trials.append(Trial(number, draft.settings, config, draft.under))
         return trials, self._config(shared)
 
@@ -434,6 +440,10 @@ class Evaluate:
             raise InputError("--randomization, --figure and --seed do not go with --reality: leave them out")
         if self.keep is not None:
             RunDirectory(self.keep).check_free()
+        if self.keep is not None and set(self.reality) == {"test"}:
+            raise InputError(
+                "--keep has nothing to keep: no episode of the test reality is shown; name another one too"
+            )
         runs = [RunDirectory.open(path) for path in self.runs]
         if self.reality:
             return self._measure_gaps(runs)
@@ -461,6 +471,8 @@ class Evaluate:
         """Every agent at home and in the realities."""
         from gridnav.experiment import sim_to_real
 
+        if self.keep is not None:
+            sim_to_real.check_one_maze(runs)
         episodes: list[tuple[Problem, Result]] = []
         with _progress() as on_stage:
             gaps = sim_to_real.measure(
@@ -468,7 +480,7 @@ class Evaluate:
             )
         if not gaps:
             raise InputError("none of the runs has an agent that drives a robot")
-        if self.keep is not None and episodes:
+        if self.keep is not None:
             asked = {"runs": [str(path) for path in self.runs], "reality": self.reality, "episodes": self.episodes}
             sim_to_real.keep(self.keep, episodes, {"command": "evaluate", **asked})
         if self.output is not None:

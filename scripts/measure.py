@@ -27,7 +27,7 @@ from gridnav.envs import RANDOMIZATION_PRESETS, Randomization
 from gridnav.experiment.evaluation import evaluate, policy_for
 from gridnav.experiment.ladder import steps_to
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
-from gridnav.experiment.training import BUDGETS, Choice, Workshop, carry_weights, make_learner
+from gridnav.experiment.training import BUDGETS, Choice, Job, Workshop, carry_weights, make_learner
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.metrics import Summary, summarise
 
@@ -251,7 +251,7 @@ def _workshop(seed: int, problem: Problem = PROBLEM) -> Iterator[tuple[Workshop,
         RunDirectory.create(Path(folder) / "run", "measure", {}) as run,
         MetricsLog(run) as log,
     ):
-        yield Workshop(problem, BUDGET, seed, run, log, lambda name: lambda progress: None), log
+        yield Workshop(Job(problem, BUDGET, seed, run, lambda name: lambda progress: None), log), log
 
 
 if __name__ == "__main__":

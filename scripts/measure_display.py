@@ -28,7 +28,7 @@ from gridnav.experiment.live import SHARE, Spectator, Watch
 from gridnav.experiment.policy_maps import policy_maps
 from gridnav.experiment.results import open_log
 from gridnav.experiment.run_directory import RunDirectory
-from gridnav.experiment.training import BUDGETS, Choice, Workshop
+from gridnav.experiment.training import BUDGETS, Choice, Job, Workshop
 from gridnav.experiment.video import write_video
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.metrics import Episode
@@ -131,7 +131,7 @@ def trained(steps: int, seed: int, port: int) -> tuple[float, float, float]:
         open_log(run) as log,
     ):
         budget, quiet = BUDGETS["default"], lambda _: lambda _: None
-        workshop = Workshop(PROBLEM, budget, seed, run, log, quiet, spectator=spectator)
+        workshop = Workshop(Job(PROBLEM, budget, seed, run, quiet, spectator=spectator), log)
         began = time.process_time()
         seconds = workshop.train("ppo", "ppo", "DiffDrive", choice=choice).seconds
         return seconds, time.process_time() - began, spectator.looked_s if spectator else 0.0

@@ -25,7 +25,7 @@ from gridnav.experiment.evaluation import evaluate, follow, policy_for
 from gridnav.experiment.greedy_curve import SUCCESS, GreedyCurve, curve_points
 from gridnav.experiment.results import open_log
 from gridnav.experiment.run_directory import RunDirectory, read_rows
-from gridnav.experiment.training import Budget, Choice, Trained, Workshop
+from gridnav.experiment.training import Budget, Choice, Job, Trained, Workshop
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.metrics import summarise
 from gridnav.problem.potential import CellPotential
@@ -315,7 +315,7 @@ def train_arm(run: RunDirectory, name: str, *, crash_at: int = 0, with_curve: bo
     assert prepare is not None
     carry = prepare(CORNER, sources_of(name))
     with open_log(run) as log:
-        workshop = Workshop(CORNER, Budget(1.0, 2), 0, run, log, on_stage, checkpoint_s=0.0)
+        workshop = Workshop(Job(CORNER, Budget(1.0, 2), 0, run, on_stage, checkpoint_s=0.0), log)
         choice = Choice(changes=CHANGES)
         return workshop.train(name, "ppo", "Unicycle", carry=carry, choice=choice, with_curve=with_curve)
 

@@ -13,7 +13,7 @@ from gridnav.display.viewer import ViewerError, address_of, free_port, headless_
 from gridnav.experiment.live import Spectator, Watch
 from gridnav.experiment.results import open_log
 from gridnav.experiment.run_directory import RunDirectory
-from gridnav.experiment.training import Budget, Choice, Trained, Workshop
+from gridnav.experiment.training import Budget, Choice, Job, Trained, Workshop
 from gridnav.experiment.worlds import Problem
 
 PROBLEM = Problem.load("S...\n.#..\n...G", "default", "default")
@@ -24,7 +24,7 @@ def train(path: Path, spectator: Spectator | None) -> Trained:
         return lambda progress: None
 
     with RunDirectory.create(path, "train", {}) as run, open_log(run) as log:
-        workshop = Workshop(PROBLEM, Budget(0.2, 2), 0, run, log, quiet, spectator=spectator)
+        workshop = Workshop(Job(PROBLEM, Budget(0.2, 2), 0, run, quiet, spectator=spectator), log)
         return workshop.train("q", "q-learning", "GridWorld", choice=Choice(changes={"num_envs": "16", "visits": "50"}))
 
 

@@ -30,7 +30,7 @@ from gridnav.experiment.evaluation import EVALUATION_SEED, evaluate_in
 from gridnav.experiment.results import open_log
 from gridnav.experiment.rollouts import Rollouts, load_rollouts, save_rollouts
 from gridnav.experiment.run_directory import RunDirectory
-from gridnav.experiment.training import Budget, Choice, Workshop
+from gridnav.experiment.training import Budget, Choice, Job, Workshop
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.layout import NAMED_LAYOUTS, Layout
 from gridnav.problem.types import FloatArray, InputError, State
@@ -962,7 +962,7 @@ def test_a_training_with_a_curriculum_that_breaks_off_goes_on_bit_for_bit(tmp_pa
 
         problem = Problem.load("S...\n.#..\n...G", "default", "default", "curriculum")
         with open_log(run) as log:
-            workshop = Workshop(problem, Budget(0.1, 2), 0, run, log, lambda name: on_progress, checkpoint_s=0.0)
+            workshop = Workshop(Job(problem, Budget(0.1, 2), 0, run, lambda name: on_progress, checkpoint_s=0.0), log)
             workshop.train("ppo", "ppo", "Unicycle", choice=Choice(changes=changes))
         return run
 

@@ -28,7 +28,7 @@ from gridnav.experiment.checkpoint import Standing, clear_leftovers, last_standi
 from gridnav.experiment.course import CHECKPOINT_SHARE, Clock
 from gridnav.experiment.results import evaluation, open_log
 from gridnav.experiment.run_directory import RunDirectory, RunInUseError
-from gridnav.experiment.training import AgentKind, Budget, Choice, Workshop
+from gridnav.experiment.training import AgentKind, Budget, Choice, Job, Workshop
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.types import InputError
 
@@ -86,7 +86,7 @@ def train(run: RunDirectory, kind: AgentKind, *, crash_at: int = 0, checkpoint_s
 
     problem, budget = Problem.load(LAYOUT, "default", "default"), Budget(QUICK, EPISODES[kind])
     with open_log(run) as log:
-        workshop = Workshop(problem, budget, 0, run, log, on_stage, checkpoint_s=checkpoint_s)
+        workshop = Workshop(Job(problem, budget, 0, run, on_stage, checkpoint_s=checkpoint_s), log)
         trained = workshop.train(kind, kind, WORLDS[kind], choice=Choice(changes=CHANGES[kind]))
         return rows_of(evaluation([workshop.evaluate(kind, trained, WORLDS[kind], kind)]))
 
@@ -195,7 +195,7 @@ def test_an_interrupt_in_the_last_moment_of_a_training_is_not_lost(tmp_path: Pat
 
     problem, budget = Problem.load(LAYOUT, "default", "default"), Budget(QUICK, 50)
     with open_log(run) as log, pytest.raises(KeyboardInterrupt):
-        Workshop(problem, budget, 0, run, log, lambda name: on_progress, checkpoint_s=0.0).train(
+        Workshop(Job(problem, budget, 0, run, lambda name: on_progress, checkpoint_s=0.0), log).train(
             "q-learning", "q-learning", "GridWorld", choice=Choice(changes=CHANGES["q-learning"])
         )
 
@@ -215,7 +215,7 @@ def test_many_checkpoints_between_two_reports_all_count_as_newer(tmp_path: Path)
 
     problem, budget = Problem.load(LAYOUT, "default", "default"), Budget(QUICK, 4)
     with open_log(run) as log:
-        Workshop(problem, budget, 0, run, log, lambda name: on_progress, checkpoint_s=0.0).train(
+        Workshop(Job(problem, budget, 0, run, lambda name: on_progress, checkpoint_s=0.0), log).train(
             "q-learning", "q-learning", "GridWorld", choice=Choice(changes={"num_envs": "16", "visits": "100"})
         )
 
@@ -234,7 +234,7 @@ def test_a_second_agent_of_a_run_goes_on_after_the_first(tmp_path: Path) -> None
 
         problem, choice = Problem.load(LAYOUT, "default", "default"), Choice(changes=CHANGES["q-learning"])
         with open_log(run) as log:
-            workshop = Workshop(problem, Budget(QUICK, 2), 0, run, log, lambda name: on_progress, checkpoint_s=0.0)
+            workshop = Workshop(Job(problem, Budget(QUICK, 2), 0, run, lambda name: on_progress, checkpoint_s=0.0), log)
             workshop.train("plan", "plan", "GridWorld")
             workshop.train("first", "q-learning", "GridWorld", choice=choice)
             workshop.train("second", "q-learning", "GridWorld", choice=choice)
@@ -489,7 +489,7 @@ def test_an_interrupted_training_goes_on_bit_for_bit(tmp_path: Path, reference: 
 
     problem, budget = Problem.load(LAYOUT, "default", "default"), Budget(QUICK, 50)
     with open_log(run) as log, pytest.raises(KeyboardInterrupt):
-        Workshop(problem, budget, 0, run, log, lambda name: on_progress, checkpoint_s=3600.0).train(
+        Workshop(Job(problem, budget, 0, run, lambda name: on_progress, checkpoint_s=3600.0), log).train(
             "q-learning", "q-learning", "GridWorld", choice=Choice(changes=CHANGES["q-learning"])
         )
     whole = load_checkpoint(run.checkpoints, "q-learning")

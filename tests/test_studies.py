@@ -10,13 +10,15 @@ import pytest
 from command_line import run_cli
 from matplotlib import pyplot as plt
 
-from gridnav.agents import Progress
+from gridnav.agents import PPO_PRESETS, Progress
 from gridnav.display.responses import Panel, Response, responses
 from gridnav.envs import PARAMETERS, RANDOMIZATION_PRESETS, Randomization
 from gridnav.experiment.findings import write_study
-from gridnav.experiment.run_directory import RunDirectory
+from gridnav.experiment.run_directory import RunDirectory, write_json
+from gridnav.experiment.sim_to_real import MEASURED
 from gridnav.experiment.studies import GROUPS, Draft, Wish, plan
 from gridnav.experiment.sweep import Outcome, Trial
+from gridnav.problem.metrics import Summary
 from gridnav.problem.types import InputError
 
 
@@ -34,11 +36,24 @@ def finished(path: Path, randomization: str = "none") -> Path:
 def test_presets_trains_under_each_preset_with_each_seed_and_tests_in_the_same_places() -> None:
     drafts = plan("presets", Wish(seeds=(0, 1)))
 
-    assert [(one.settings["randomization"], one.settings["seed"]) for one in drafts] == [
+    whole = [one for one in drafts if one.settings["training"] == "whole"]
+    assert [(one.settings["randomization"], one.settings["seed"]) for one in whole] == [
         (preset, seed) for preset in RANDOMIZATION_PRESETS for seed in ("0", "1")
     ]
     assert {tuple(one.under) for one in drafts} == {("none", "burger", "wide")}
     assert all(one.fields["agent"] == "ppo" for one in drafts)
+
+
+def test_presets_has_trainings_that_end_early_so_that_policies_differ_in_quality() -> None:
+    short = [one for one in plan("presets", Wish(seeds=(0,))) if one.settings["training"] != "whole"]
+
+    assert {one.settings["randomization"] for one in short} == {"none", "wide"}
+    for one in short:
+        preset = "default" if one.settings["randomization"] == "none" else "randomized"
+        (change,) = one.fields["set"]
+        assert change.startswith("steps=")
+        # By hand: at most a third of what a whole training takes.
+        assert int(change.removeprefix("steps=")) <= PPO_PRESETS[preset].steps / 3
 
 
 def test_leave_one_out_leaves_out_one_group_at_a_time() -> None:
@@ -92,7 +107,8 @@ def test_the_default_study_is_arms_and_presets() -> None:
     drafts = plan("default", Wish(seeds=(0, 1, 2)))
 
     parts = [one.settings["study"] for one in drafts]
-    assert parts == ["arms"] * 3 + ["presets"] * 3 * len(RANDOMIZATION_PRESETS)
+    # By hand: four lengths of trainings that end early, beside the whole ones.
+    assert parts == ["arms"] * 3 + ["presets"] * 3 * (len(RANDOMIZATION_PRESETS) + 4)
 
 
 @pytest.mark.parametrize(
@@ -150,7 +166,7 @@ def conclude(study: str, drafts: list[Draft], successes: Mapping[tuple[str, str]
         for one in trials
     ]
     with RunDirectory.create(Path("study"), "sweep", {}) as sweep:
-        return write_study(study, trials, outcomes, sweep, unseen, command="", config={})
+        return write_study(study, trials, outcomes, sweep, unseen, jobs=1, command="", config={})
 
 
 def unseen(name: str) -> Callable[[Progress], None]:
@@ -183,7 +199,48 @@ def test_a_study_all_of_whose_trials_of_a_kind_failed_says_so() -> None:
         RunDirectory.create(Path("study"), "sweep", {}) as sweep,
         pytest.raises(InputError, match="every trial of burger failed"),
     ):
-        write_study("presets", trials, [Outcome([], "boom")] * len(trials), sweep, unseen, command="", config={})
+        write_study(
+            "presets", trials, [Outcome([], "boom")] * len(trials), sweep, unseen, jobs=1, command="", config={}
+        )
+
+
+def test_presets_counts_policies_that_ended_early_where_realities_are_foretold_and_nowhere_else() -> None:
+    at_home, away = {"none": 1.0, "burger": 0.9}, {"none": 0.5, "burger": 0.8}
+    trials, outcomes = [], []
+    for number, one in enumerate(plan("presets", Wish(seeds=(0, 1)))):
+        preset, is_whole = one.settings["randomization"], one.settings["training"] == "whole"
+        share = 1.0 if is_whole else 0.25
+        trials.append(Trial(number, one.settings, one.fields, one.under))
+        rows = [row(share * at_home.get(preset, 0.9), under) for under in one.under]
+        outcomes.append(Outcome([], "boom") if number == 0 else Outcome(rows))
+        folder = trials[-1].folder(RunDirectory(Path("study")))
+        folder.mkdir(parents=True)
+        write_json(folder / "config.json", {})
+        measured = {"home": share * at_home.get(preset, 0.9), "away": share * away.get(preset, 0.7)}
+        there = {place: vars(summary(measured["away"])) for place in ("parametric", "structural")}
+        asked = {"realities": ["parametric", "structural"], "episodes": 200}
+        write_json(folder / MEASURED, {**asked, "home": vars(summary(measured["home"])), "away": there})
+    sweep = RunDirectory(Path("study"))
+    sweep.figures.mkdir()
+
+    sentence = write_study("presets", trials, outcomes, sweep, unseen, jobs=1, command="", config={"budget": "default"})
+
+    # By hand: 80 % of 90 % under burger; without anything that varies the one seed that is left keeps 50 of 100 %.
+    assert "parametric reality PPO trained under burger does best: 80.0 %, and at home 90.0 %" in sentence
+    assert "trained where nothing varies it reaches 50.0 %" in sentence
+    assert "1 of 18 trials failed" in sentence
+    assert "Correlation over 17 policies" in Path("study/report.html").read_text(encoding="utf-8")
+
+
+def summary(success: float) -> Summary:
+    """Of episodes of which so many arrived."""
+    ends = (success, success)
+    return Summary(
+        episodes=200, success_rate=success, success_interval=ends, spl=success, spl_interval=ends, sct=success,
+        sct_interval=ends, collision_rate=0.0, collisions_per_metre=0.0, time_to_goal_s=None, median_time_s=None,
+        mean_return=0.0, physics_errors=0, clearance_m=None, turn_per_metre_rad=None, jerk_m_s3=None,
+        action_change=None, still_share=None, layouts=1, success_cvar=success, behaviours={},
+    )  # fmt: skip
 
 
 def test_responses_draws_each_point_with_its_interval_and_marks_the_range_of_training() -> None:

@@ -17,8 +17,8 @@ from joblib.externals.loky import get_reusable_executor
 
 from gridnav.experiment.design import settings_of
 from gridnav.experiment.run_directory import RunDirectory, RunInUseError
-from gridnav.experiment.sweep import WATCH_S, _end_with
 from gridnav.experiment.trials import trial
+from gridnav.experiment.workers import WATCH_S, _end_with
 from gridnav.problem.types import InputError
 
 LAYOUT = "......\n.####.\n......\n.####.\n......"

@@ -75,7 +75,7 @@ def test_an_arm_is_measured_against_scratch() -> None:
 def test_negative_transfer_is_named() -> None:
     harmed = transfer([learnt(SLOW)], [learnt(QUICK)], 100)
 
-    assert harmed.negative == ("an asymptote 12 points lower", "10.0 times the steps", "an area 49% smaller")
+    assert harmed.negative == ("an asymptote 12 points lower", "10.0 times the steps", "an area 49 % smaller")
 
 
 def test_harm_that_the_seeds_do_not_show_is_not_named() -> None:

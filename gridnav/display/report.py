@@ -9,6 +9,7 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -16,6 +17,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from gridnav.display.figures import svg_text
+from gridnav.display.words import percent, thousands
 from gridnav.problem.metrics import Summary
 
 
@@ -104,7 +106,7 @@ def write_report(path: str | Path, report: Report) -> None:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(percent=_percent, share=_share, duration=_duration, count=_count)
+    environment.filters.update(percent=partial(percent, digits=0), share=_share, duration=_duration, count=thousands)
     page = environment.get_template("report.html").render(
         report=report,
         drawings=[_drawing(number, picture) for number, picture in enumerate(report.pictures, start=1)],
@@ -122,17 +124,8 @@ def _drawing(number: int, picture: Picture) -> Markup:
     return label + Markup(svg.removeprefix("<svg"))  # noqa: S704, matplotlib escapes the names in it
 
 
-def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %"
-
-
 def _share(value: float) -> str:
     return f"{value:.2f}"
-
-
-def _count(number: int) -> str:
-    """Thousands apart, without a line break between."""
-    return f"{number:,}".replace(",", "\u202f")
 
 
 def _duration(seconds: float) -> str:

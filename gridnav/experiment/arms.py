@@ -213,13 +213,10 @@ def potential_of(worlds: NavigationVectorEnv, values: FloatArray) -> Callable[[A
         values: Of each goal and cell, shape ``(n_goals, n_rows, n_cols)``.
     """
     place_value = CellPotential(worlds.layout, values)
-    goals = worlds.goal_cells
-    rank = np.zeros(worlds.layout.walls.shape, dtype=np.int64)
-    rank[tuple(goals.T)] = np.arange(len(goals))
 
     def of(observations: Any) -> FloatArray:
         poses, goals_w = worlds.features.poses_and_goals(observations)
-        cells = worlds.layout.to_cell(goals_w)
-        return place_value(poses, rank[cells[:, 0], cells[:, 1]])
+        goals = worlds.layout.to_cell(goals_w)
+        return place_value(poses, worlds.goal_ranks[tuple(goals.T)])
 
     return of

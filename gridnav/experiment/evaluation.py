@@ -64,19 +64,14 @@ def drive_by_moves(agent: Agent, worlds: NavigationVectorEnv) -> Policy:
     layout, n = worlds.layout, worlds.num_envs
     period_s: float = worlds.control_period_s  # type: ignore[attr-defined]
     driver = MoveDriver(layout, worlds.robot, period_s, n)
-    goals = worlds.goal_cells
-    goal_rank = np.full((layout.n_rows, layout.n_cols), 0)
-    goal_rank[tuple(goals.T)] = np.arange(len(goals))
     started = np.zeros(n, dtype=bool)
 
     def act(observations: NDArray[Any]) -> NDArray[Any]:
         poses, goals_w = worlds.features.poses_and_goals(observations)
         due = np.flatnonzero(driver.finished(poses) | ~started)
         if due.size:
-            cells, goal_cells = layout.to_cell(poses[due, :2]), layout.to_cell(goals_w[due])
-            number = cells[:, 0] * layout.n_cols + cells[:, 1]
-            moves = agent.act(number * len(goals) + goal_rank[tuple(goal_cells.T)])
-            driver.begin(due, poses[due], moves)
+            seen = worlds.cell_goal(layout.to_cell(poses[due, :2]), layout.to_cell(goals_w[due]))
+            driver.begin(due, poses[due], agent.act(seen))
             started[due] = True
         return driver.commands(poses).astype(np.float32)
 
@@ -93,18 +88,15 @@ def follow(moves_for: Policy, worlds: NavigationVectorEnv) -> Policy:
         moves_for: Moves for ``cell_goal`` observations.
         worlds: Of the kind of robots it will drive.
     """
-    layout, robot, goals = worlds.layout, worlds.robot, worlds.goal_cells
+    layout, robot = worlds.layout, worlds.robot
     period_s: float = worlds.control_period_s  # type: ignore[attr-defined]
-    goal_rank = np.full((layout.n_rows, layout.n_cols), 0)
-    goal_rank[tuple(goals.T)] = np.arange(len(goals))
 
     def act(observations: NDArray[Any]) -> NDArray[Any]:
         poses, goals_w = worlds.features.poses_and_goals(observations)
-        cells, goal_cells = layout.to_cell(poses[:, :2]), layout.to_cell(goals_w)
-        number = cells[:, 0] * layout.n_cols + cells[:, 1]
-        moves = moves_for(number * len(goals) + goal_rank[tuple(goal_cells.T)])
-        is_there = (cells == goal_cells).all(axis=1, keepdims=True)  # a table knows no move in the goal's own cell
-        targets = np.where(is_there, layout.to_metres(goal_cells), lead(poses, moves, layout))
+        cells, goals = layout.to_cell(poses[:, :2]), layout.to_cell(goals_w)
+        moves = moves_for(worlds.cell_goal(cells, goals))
+        is_there = (cells == goals).all(axis=1, keepdims=True)  # a table knows no move in the goal's own cell
+        targets = np.where(is_there, layout.to_metres(goals), lead(poses, moves, layout))
         return glide(poses, targets, robot, period_s).astype(np.float32)
 
     return act

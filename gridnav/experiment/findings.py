@@ -13,13 +13,14 @@ from gridnav.display.curves import kept_success, success_bars
 from gridnav.display.report import Picture, Report, Table, write_report
 from gridnav.display.responses import Panel, Response, responses
 from gridnav.display.style import save_figure
+from gridnav.display.words import percent, percent_interval
 from gridnav.envs import PARAMETERS, Randomization
 from gridnav.experiment.across_seeds import labels_of
 from gridnav.experiment.run_directory import RunDirectory
 from gridnav.experiment.sim_to_real import Gap, correlation, measure_once
-from gridnav.experiment.studies import EVERYTHING, NOTHING, PARTS, UNDER
+from gridnav.experiment.studies import EVERYTHING, NOTHING, PARTS, UNDER, WHOLE
 from gridnav.experiment.sweep import Outcome, Trial
-from gridnav.experiment.training import OnStage
+from gridnav.experiment.training import BUDGETS, OnStage
 from gridnav.experiment.transfer import transfer_report, write_transfer
 from gridnav.experiment.trials import Row
 from gridnav.problem.metrics import Summary
@@ -32,6 +33,10 @@ OVER_SEEDS = (
 )
 DEVELOPMENT = ("parametric", "structural")
 """Realities that a study of presets looks at."""
+Middle = tuple[float, float, float]
+"""Interquartile mean of a number over seeds, and the ends of its interval."""
+Measured = Callable[[Mapping[str, RunDirectory]], list[Gap]]
+"""The policies of finished runs, named, at home and in realities."""
 QUESTIONS = {
     "arms": "What does a robot save that begins with what was learnt on an easier rung?",
     "presets": "Does training in a world that varies help in worlds that no training saw?",
@@ -63,29 +68,31 @@ class Findings:
 # ---- Studies that train ---------------------------------------------------------------------------------
 
 
-def _find_arms(done: Sequence[Done], sweep: RunDirectory, on_stage: OnStage) -> Findings:
+def _find_arms(done: Sequence[Done], sweep: RunDirectory, measured: Measured) -> Findings:
     runs = [RunDirectory.open(one.trial.folder(sweep)) for one in done if not one.outcome.error]
     report = transfer_report(runs)
     write_transfer(sweep.figures, report)
     return Findings(report.sentence, [report.table], {"transfer": report.picture})
 
 
-def _find_presets(done: Sequence[Done], sweep: RunDirectory, on_stage: OnStage) -> Findings:
-    cells = _cells(done, "randomization")
+def _find_presets(done: Sequence[Done], sweep: RunDirectory, measured: Measured) -> Findings:
+    whole = [one for one in done if one.trial.settings["training"] == WHOLE]
+    cells = _cells(whole, "randomization")
     presets = list(dict.fromkeys(preset for preset, _ in cells))
     bars = {f"{preset}, tested under {under}": cells[preset, under].success for under in UNDER for preset in presets}
     caption = "Success of PPO trained under each preset, tested where nothing varies, under burger and under wide."
     table = _matrix("Trained under, tested under", "trained under", cells, presets, list(UNDER))
-    finished = [one.trial for one in done if not one.outcome.error]
-    runs = {" ".join(one.settings.values()): RunDirectory.open(one.folder(sweep)) for one in finished}
-    episodes = int(done[0].outcome.rows[0]["episodes"])
-    gaps = measure_once(runs, DEVELOPMENT, episodes, on_stage)
+    finished = [one for one in done if not one.outcome.error]
+    gaps = measured(
+        {" ".join(one.trial.settings.values()): RunDirectory.open(one.trial.folder(sweep)) for one in finished}
+    )
     by_preset: dict[str, list[Gap]] = {preset: [] for preset in presets}
-    for one, gap in zip(finished, gaps.values(), strict=True):
-        by_preset[one.settings["randomization"]].append(gap)
+    for one, gap in zip(finished, gaps, strict=True):
+        if one in whole:
+            by_preset[one.trial.settings["randomization"]].append(gap)
     return Findings(
         " ".join(_kept_words(by_preset, place) for place in DEVELOPMENT),
-        [_kept_table(by_preset), table, _foretelling(done, list(gaps.values()))],
+        [_kept_table(by_preset), table, _foretelling(finished, gaps)],
         {"realities": _kept_picture(by_preset), "presets": Picture(success_bars(bars, target=None), caption)},
     )
 
@@ -95,20 +102,19 @@ def _kept_words(gaps: Mapping[str, Sequence[Gap]], place: str) -> str:
     away = {name: _successes([gap.away[place] for gap in here]) for name, here in gaps.items()}
     best = max(away, key=lambda name: away[name][0])
     home = _successes([gap.at_home for gap in gaps[best]])
-    words = f"In the {place} reality PPO trained under {best} does best: {_interval(away[best])}, and at home "
-    words += _interval(home)
+    words = f"In the {place} reality PPO trained under {best} does best: {percent_interval(away[best])}, and at home "
+    words += percent_interval(home)
     if best != "none" and "none" in away:
-        words += f"; trained where nothing varies it reaches {_interval(away['none'])}"
+        words += f"; trained where nothing varies it reaches {percent_interval(away['none'])}"
     return words + "."
 
 
 def _foretelling(done: Sequence[Done], gaps: Sequence[Gap]) -> Table:
     """How well success in each simulation foretells that in realities, over all policies."""
-    finished = [one.outcome.rows for one in done if not one.outcome.error]
     simulated = {"at home": [gap.at_home.success_rate for gap in gaps]}
     for under in UNDER:
         simulated[f"under {under}"] = [
-            float(row["success"]) for rows in finished for row in rows if row["under"] == under
+            float(row["success"]) for one in done for row in one.outcome.rows if row["under"] == under
         ]
     rows = []
     for name, successes in simulated.items():
@@ -121,7 +127,8 @@ def _foretelling(done: Sequence[Done], gaps: Sequence[Gap]) -> Table:
         rows.append([name, *words])
     legend = (
         f"Correlation over {len(gaps)} policies of success in a simulation with success in a reality (SRCC), with 95 % "
-        "bootstrap intervals over policies. At home every policy has a world of its own; the others are one for all."
+        "bootstrap intervals over policies. At home every policy has a world of its own; the others are one for all. "
+        "Trainings that ended early are among them, so that the policies differ in quality."
     )
     return Table("Which simulation foretells realities", ("simulation", *DEVELOPMENT), rows, legend)
 
@@ -132,10 +139,11 @@ def _kept_table(gaps: Mapping[str, Sequence[Gap]]) -> Table:
         for place in DEVELOPMENT:
             kept = [gap.retention(place)[0] for gap in here]
             away = [gap.away[place] for gap in here]
+            successes = [_successes([gap.at_home for gap in here]), _successes(away)]
             rows.append(
-                [name, place, _interval(_successes([gap.at_home for gap in here])), _interval(_successes(away)),
+                [name, place, *map(percent_interval, successes),
                  f"{float(iqm(kept)):.2f} ({min(kept):.2f} to {max(kept):.2f})",
-                 _percent(float(iqm([one.collision_rate for one in away])))]
+                 percent(float(iqm([one.collision_rate for one in away])))]
             )  # fmt: skip
     columns = ("trained under", "reality", "success at home", "success there", "kept", "collided there")
     legend = f"Home is what the policy was trained under. Kept: mean and range over seeds. {OVER_SEEDS}"
@@ -152,20 +160,17 @@ def _kept_picture(gaps: Mapping[str, Sequence[Gap]]) -> Picture:
     return Picture(kept_success(home, away), f"{words} All of them are simulations. {OVER_SEEDS}")
 
 
-def _successes(summaries: Sequence[Summary]) -> tuple[float, float, float]:
-    """Middle and interval over seeds."""
-    if len(summaries) == 1:
-        return summaries[0].success_rate, *summaries[0].success_interval
-    scores = [one.success_rate for one in summaries]
-    return float(iqm(scores)), *stratified_bootstrap([scores], rng=np.random.default_rng(0))
+def _successes(summaries: Sequence[Summary]) -> Middle:
+    """Success over seeds."""
+    return _over_seeds([one.success_rate for one in summaries], summaries[0].success_interval)
 
 
-def _find_leave_one_out(done: Sequence[Done], sweep: RunDirectory, on_stage: OnStage) -> Findings:
+def _find_leave_one_out(done: Sequence[Done], sweep: RunDirectory, measured: Measured) -> Findings:
     cells = _cells(done, "without")
     names = list(dict.fromkeys(name for name, _ in cells))
     parts = [name for name in names if name not in (NOTHING, EVERYTHING)]
     worst = min(parts, key=lambda name: cells[name, "whole"].success[0])
-    reached = {name: _interval(cells[name, "whole"].success) for name in names}
+    reached = {name: percent_interval(cells[name, "whole"].success) for name in names}
     sentence = (
         f"Under the whole randomization, PPO that was trained in it reaches {reached[NOTHING]}; what it misses most is "
         f"{worst}: trained without, it reaches {reached[worst]}, and without everything {reached[EVERYTHING]}."
@@ -182,7 +187,7 @@ def _find_leave_one_out(done: Sequence[Done], sweep: RunDirectory, on_stage: OnS
 # ---- Studies of finished runs ---------------------------------------------------------------------------
 
 
-def _find_one_at_a_time(done: Sequence[Done], sweep: RunDirectory, on_stage: OnStage) -> Findings:
+def _find_one_at_a_time(done: Sequence[Done], sweep: RunDirectory, measured: Measured) -> Findings:
     lines = _lines(done, "quantity", "value")
     quantities = list(dict.fromkeys(one.trial.settings["quantity"] for one in done))
     trained = _trained(done)
@@ -199,7 +204,7 @@ def _find_one_at_a_time(done: Sequence[Done], sweep: RunDirectory, on_stage: OnS
             range_words = "-" if ends is None else _ends(*ends)
             low, high = line.x[0], line.x[-1]
             rows.append(
-                [name, label, unit, range_words, _ends(low, high), _percent(at_nominal), _percent(line.y[worst]),
+                [name, label, unit, range_words, _ends(low, high), percent(at_nominal), percent(line.y[worst]),
                  f"{line.x[worst]:g}"]
             )  # fmt: skip
     name, label = max(falls, key=lambda key: falls[key])
@@ -217,17 +222,17 @@ def _find_one_at_a_time(done: Sequence[Done], sweep: RunDirectory, on_stage: OnS
     )
 
 
-def _find_strength(done: Sequence[Done], sweep: RunDirectory, on_stage: OnStage) -> Findings:
+def _find_strength(done: Sequence[Done], sweep: RunDirectory, measured: Measured) -> Findings:
     lines = {label: line for (label, _), line in _lines(done, "", "strength").items()}
     area = {label: float(np.trapezoid(line.y, line.x) / (line.x[-1] - line.x[0])) for label, line in lines.items()}
     best = max(area, key=lambda label: area[label])
     at = {label: [line.y[line.x.index(k)] for k in (0.0, 1.0, 2.0)] for label, line in lines.items()}
-    told = [f"{label} {', '.join(map(_percent, at[label]))}" for label in lines]
+    told = [f"{label} {', '.join(map(percent, at[label]))}" for label in lines]
     sentence = (
         f"Success at strength 0, 1 and 2: {'; '.join(told)}. On average over strengths {best} reaches "
-        f"{_percent(area[best])}."
+        f"{percent(area[best])}."
     )
-    rows = [[label, *map(_percent, at[label]), _percent(area[label])] for label in lines]
+    rows = [[label, *map(percent, at[label]), percent(area[label])] for label in lines]
     columns = ("agent", "strength 0", "strength 1", "strength 2", "mean over strengths")
     table = Table("Robustness", columns, rows, "The mean is the area under the curve over its width. " + OVER_SEEDS)
     figure = responses([Panel("strength of the randomization (1: as given, 0: nothing varies)", lines)])
@@ -248,7 +253,7 @@ def _lines(done: Sequence[Done], group: str, x: str) -> dict[tuple[str, str], Re
     lines = {}
     for key, by_value in points.items():
         values = sorted(by_value)
-        triples = [_over_seeds(by_value[value], "success") for value in values]
+        triples = [_number(by_value[value], "success") for value in values]
         lines[key] = Response(values, *(list(part) for part in zip(*triples, strict=True)))
     if not lines:
         raise InputError("no trial of the study gave a result: see the errors in its table")
@@ -272,9 +277,9 @@ def _trained(done: Sequence[Done]) -> dict[str, tuple[float, float]]:
 class _Cell:
     """One kind of training in one kind of test, over seeds: middle and interval."""
 
-    success: tuple[float, float, float]
-    spl: tuple[float, float, float]
-    collided: tuple[float, float, float]
+    success: Middle
+    spl: Middle
+    collided: Middle
     n_seeds: int
 
 
@@ -289,16 +294,22 @@ def _cells(done: Sequence[Done], column: str) -> dict[tuple[str, str], _Cell]:
     if missing:
         raise InputError(f"every trial of {sorted(missing)[0]} failed: see the errors in the table")
     return {
-        key: _Cell(_over_seeds(rows, "success"), _over_seeds(rows, "spl"), _over_seeds(rows, "collided"), len(rows))
+        key: _Cell(_number(rows, "success"), _number(rows, "spl"), _number(rows, "collided"), len(rows))
         for key, rows in groups.items()
     }
 
 
-def _over_seeds(rows: Sequence[Row], name: str) -> tuple[float, float, float]:
-    """Middle and 95 % interval of a number over seeds; the episodes' own interval where there is one seed."""
+def _number(rows: Sequence[Row], name: str) -> Middle:
+    """A number of the rows over seeds."""
     scores = [float(row[name]) for row in rows]
+    low, high = (float(rows[0].get(f"{name}_{end}", scores[0])) for end in ("low", "high"))
+    return _over_seeds(scores, (low, high))
+
+
+def _over_seeds(scores: Sequence[float], own: tuple[float, float]) -> Middle:
+    """Middle and 95 % interval over seeds; the episodes' own interval where there is one seed."""
     if len(scores) == 1:
-        return scores[0], float(rows[0].get(f"{name}_low", scores[0])), float(rows[0].get(f"{name}_high", scores[0]))
+        return scores[0], *own
     return float(iqm(scores)), *stratified_bootstrap([scores], rng=np.random.default_rng(0))
 
 
@@ -311,25 +322,16 @@ def _matrix(
     rows = []
     for name in names:
         here = cells[name, tests[0]]
-        successes = [_interval(cells[name, test].success) for test in tests]
-        rows.append([name, *successes, f"{here.spl[0]:.2f}", _percent(here.collided[0]), str(here.n_seeds)])
+        successes = [percent_interval(cells[name, test].success) for test in tests]
+        rows.append([name, *successes, f"{here.spl[0]:.2f}", percent(here.collided[0]), str(here.n_seeds)])
     return Table(title, columns, rows, f"SPL and collisions are those under {tests[0]}. {OVER_SEEDS}")
-
-
-def _interval(triple: tuple[float, float, float]) -> str:
-    value, low, high = triple
-    return f"{100 * value:.1f} %" + ("" if low == high else f" ({100 * low:.1f} to {100 * high:.1f} %)")
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.1f} %"
 
 
 def _ends(low: float, high: float) -> str:
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
-FINDERS: dict[str, Callable[[Sequence[Done], RunDirectory, OnStage], Findings]] = {
+FINDERS: dict[str, Callable[[Sequence[Done], RunDirectory, Measured], Findings]] = {
     "arms": _find_arms,
     "presets": _find_presets,
     "leave-one-out": _find_leave_one_out,
@@ -345,6 +347,7 @@ def write_study(
     sweep: RunDirectory,
     on_stage: OnStage,
     *,
+    jobs: int,
     command: str,
     config: Mapping[str, Any],
 ) -> str:
@@ -356,6 +359,7 @@ def write_study(
         outcomes: What came of them.
         sweep: Where the files go.
         on_stage: Told of evaluations in realities.
+        jobs: How many of those at once.
         command: What makes the study again.
         config: Its configuration.
 
@@ -365,11 +369,16 @@ def write_study(
     Raises:
         InputError: When so many trials failed that there is no answer.
     """
+
+    def measured(runs: Mapping[str, RunDirectory]) -> list[Gap]:
+        episodes = BUDGETS[str(config["budget"])].episodes
+        return list(measure_once(runs, DEVELOPMENT, episodes, on_stage, jobs=jobs).values())
+
     done = [Done(trial, outcome) for trial, outcome in zip(trials, outcomes, strict=True)]
     found = []
     for part in PARTS[name]:
         own = [one for one in done if one.trial.settings.get("study", part) == part]
-        found.append(FINDERS[part](own, sweep, on_stage))
+        found.append(FINDERS[part](own, sweep, measured))
     pictures = {name: picture for one in found for name, picture in one.pictures.items()}
     for file, picture in pictures.items():
         for ending in (".png", ".svg"):

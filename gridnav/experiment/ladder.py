@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from gridnav.display.words import percent, thousands
 from gridnav.experiment.arms import TABLE, Arm, Sources
 from gridnav.experiment.greedy_curve import CURVE_EPISODES, SUCCESS, GreedyCurve
-from gridnav.experiment.live import Spectator
 from gridnav.experiment.pictures import pictures
 from gridnav.experiment.results import (
     open_log,
@@ -17,11 +17,11 @@ from gridnav.experiment.results import (
     write_page,
     write_rollouts,
 )
-from gridnav.experiment.run_directory import MetricsLog, RunDirectory
-from gridnav.experiment.training import Budget, Choice, OnStage, Result, Trained, Workshop, carry_weights
+from gridnav.experiment.run_directory import MetricsLog
+from gridnav.experiment.training import Choice, Job, Result, Trained, Workshop, carry_weights
 from gridnav.experiment.transfer import QUESTION as TRANSFER_QUESTION
 from gridnav.experiment.transfer import SCRATCH, transfer_report, write_transfer
-from gridnav.experiment.worlds import NOTHING_VARIES, Problem
+from gridnav.experiment.worlds import NOTHING_VARIES
 
 QUESTION = (
     "How far does a table learnt on the grid carry a wheeled robot, and what does a network save that "
@@ -33,34 +33,15 @@ SOLVED = 0.95
 """The share of training episodes from which on a learner counts as there."""
 
 
-def climb(
-    problem: Problem,
-    budget: Budget,
-    seed: int,
-    run: RunDirectory,
-    command: str,
-    config: Mapping[str, Any],
-    on_stage: OnStage,
-    *,
-    checkpoint_s: float,
-    spectator: Spectator | None = None,
-) -> list[Result]:
+def climb(job: Job) -> list[Result]:
     """All rungs, in order, written to a run directory.
 
-    Args:
-        problem: What is to be solved. Where robots vary, there is one more rung for that; the others are without.
-        budget: How much may be spent.
-        seed: Of everything that is random in training.
-        run: Where the files go.
-        command: What makes the run again, for the report.
-        config: The run's configuration, for the report.
-        on_stage: Told of every training and evaluation.
-        checkpoint_s: Seconds between two checkpoints of a training.
-        spectator: Watches every training.
+    Where robots vary, there is one more rung for that; the others are without.
     """
+    problem, run = job.problem, job.run
     with open_log(run) as log:
         nominal = replace(problem, randomization=NOTHING_VARIES)
-        workshop = Workshop(nominal, budget, seed, run, log, on_stage, checkpoint_s=checkpoint_s, spectator=spectator)
+        workshop = Workshop(replace(job, problem=nominal), log)
         plan = workshop.train("plan", "plan", "GridWorld")
         results = [workshop.evaluate("plan", plan, "GridWorld", "value iteration")]
 
@@ -89,39 +70,20 @@ def climb(
                 workshop.evaluate("ppo-randomized", varied, "DiffDrive", "PPO under randomisation", carried=carried)
             )
 
-        _write(problem, seed, run, command, config, results, [table, warm], log)
+        _write(job, results, [table, warm], log)
     return results
 
 
-def compare(
-    problem: Problem,
-    budget: Budget,
-    seed: int,
-    arms: Mapping[str, Arm],
-    run: RunDirectory,
-    command: str,
-    config: Mapping[str, Any],
-    on_stage: OnStage,
-    *,
-    checkpoint_s: float,
-    spectator: Spectator | None = None,
-) -> list[Result]:
+def compare(job: Job, arms: Mapping[str, Arm]) -> list[Result]:
     """Arms of transfer to the MuJoCo robot side by side, with what they build on, written to a run directory.
 
     Args:
-        problem: What is to be solved.
-        budget: How much may be spent.
-        seed: Of everything that is random in training.
+        job: The run.
         arms: By name.
-        run: Where the files go.
-        command: What makes the run again, for the report.
-        config: The run's configuration, for the report.
-        on_stage: Told of every training and evaluation.
-        checkpoint_s: Seconds between two checkpoints of a training.
-        spectator: Watches every training.
     """
+    problem, run = job.problem, job.run
     with open_log(run) as log:
-        workshop = Workshop(problem, budget, seed, run, log, on_stage, checkpoint_s=checkpoint_s, spectator=spectator)
+        workshop = Workshop(job, log)
         sources, costs = Sources(workshop), {}
         trained: dict[str, Trained] = {}
         for name, arm in arms.items():
@@ -131,10 +93,9 @@ def compare(
         results += [
             workshop.evaluate(name, trained[name], TARGET, arm.agent, carried=arm.carried) for name, arm in arms.items()
         ]
-        write_evaluation(run, results, seed, arms=costs)
+        write_evaluation(run, results, job.seed, arms=costs)
         side_by_side = [one for one in results if one.name in (TABLE, "waypoint")] + results[-1:]
-        properties = {"command": command, "training seed": seed, "run": run.path.name}
-        write_rollouts(run, problem, results, side_by_side[:2] + results[-1:], properties)
+        write_rollouts(run, problem, results, side_by_side[:2] + results[-1:], _properties(job))
         shown = pictures(run, problem, results, list(trained.values())[-1:], {}, log)
     report = transfer_report([run]) if SCRATCH in arms else None
     if report is not None:
@@ -144,10 +105,10 @@ def compare(
         title=f"Arms of transfer on {problem.layout.name}",
         question=TRANSFER_QUESTION,
         conclusion=report.sentence if report else "Without the arm scratch there is nothing to compare with.",
-        rows=report_rows(results, seed),
+        rows=report_rows(results, job.seed),
         shown=[report.picture, *shown] if report else shown,
-        command=command,
-        config=config,
+        command=job.command,
+        config=job.config,
         tables=[report.table] if report else [],
     )
     return results
@@ -179,22 +140,13 @@ def _cost(trained: Trained, arm: Arm, sources: Sources) -> dict[str, Any]:
     }
 
 
-def _write(
-    problem: Problem,
-    seed: int,
-    run: RunDirectory,
-    command: str,
-    config: Mapping[str, Any],
-    results: Sequence[Result],
-    trained: Sequence[Trained],
-    log: MetricsLog,
-) -> None:
-    write_evaluation(run, results, seed)
+def _write(job: Job, results: Sequence[Result], trained: Sequence[Trained], log: MetricsLog) -> None:
+    problem, run = job.problem, job.run
+    write_evaluation(run, results, job.seed)
     by_name = {result.name: result for result in results}
     best = "ppo-warm" if _success(by_name["ppo-warm"]) >= _success(by_name["ppo-scratch"]) else "ppo-scratch"
     side_by_side = [by_name["q-learning"], by_name["q-table-diffdrive"], by_name[best]]
-    properties = {"command": command, "training seed": seed, "run": run.path.name}
-    write_rollouts(run, problem, results, side_by_side, properties)
+    write_rollouts(run, problem, results, side_by_side, _properties(job))
     curves = {
         "ppo-unicycle": "Unicycle, from scratch",
         "ppo-scratch": "DiffDrive, from scratch",
@@ -206,27 +158,33 @@ def _write(
         title=f"The ladder on {problem.layout.name}",
         question=QUESTION,
         conclusion=conclusion(by_name, log),
-        rows=report_rows(results, seed),
+        rows=report_rows(results, job.seed),
         shown=shown,
-        command=command,
-        config=config,
+        command=job.command,
+        config=job.config,
     )
+
+
+def _properties(job: Job) -> dict[str, Any]:
+    """What a recording says of its run."""
+    return {"command": job.command, "training seed": job.seed, "run": job.run.path.name}
 
 
 def conclusion(results: dict[str, Result], log: MetricsLog) -> str:
     """What the numbers say, in two sentences."""
     table, scratch, warm = (results[name] for name in ("q-table-diffdrive", "ppo-scratch", "ppo-warm"))
     steps = {name: steps_to(log, name, SOLVED) for name in ("ppo-scratch", "ppo-warm")}
+    driven, alone, carried = (percent(_success(one)) for one in (table, scratch, warm))
     first = (
-        f"The Q-table drives the MuJoCo robot to its goal in {_success(table):.1%} of {len(table.episodes)} episodes "
-        f"without having seen it; PPO reaches {_success(scratch):.1%} from scratch and {_success(warm):.1%} started on "
-        "the Unicycle's network."
+        f"The Q-table drives the MuJoCo robot to its goal in {driven} of {len(table.episodes)} episodes without having "
+        f"seen it; PPO reaches {alone} from scratch and {carried} started on the Unicycle's network."
     )
     reached = {
-        name: f"after {_thousands(count)} steps" if count else "not within the budget" for name, count in steps.items()
+        name: f"after {thousands(count)} steps" if count else "nowhere within the budget"
+        for name, count in steps.items()
     }
     second = (
-        f" In training, {SOLVED:.0%} success on the robot came {reached['ppo-scratch']} from scratch and "
+        f" In training, {percent(SOLVED, 0)} success on the robot came {reached['ppo-scratch']} from scratch and "
         f"{reached['ppo-warm']} warm-started."
     )
     return first + second
@@ -242,8 +200,3 @@ def steps_to(log: MetricsLog, series: str, success: float) -> int | None:
 
 def _success(result: Result) -> float:
     return result.summary.success_rate
-
-
-def _thousands(count: int) -> str:
-    # A narrow no-break space: the number stays on one line.
-    return f"{count:,}".replace(",", "\u202f")

@@ -81,21 +81,15 @@ class Reality:
         )
 
 
-def realities() -> dict[str, Reality]:
-    """All of them, by name."""
-    return {one.name: one for one in (_parametric(), _structural(), _sealed())}
-
-
 def find_reality(name: str) -> Reality:
     """The one of that name.
 
     Raises:
-        InputError: When there is none.
+        InputError: When there is none, or the seal of the test reality is broken.
     """
-    known = realities()
-    if name not in known:
-        raise InputError(f"unknown reality {name!r:.60}: choose {', '.join(known)}")
-    return known[name]
+    if name not in REALITIES:
+        raise InputError(f"unknown reality {name!r:.60}: choose {', '.join(REALITIES)}")
+    return REALITIES[name]()
 
 
 # ---- For development -----------------------------------------------------------------------------
@@ -196,6 +190,10 @@ def _sealed() -> Reality:
     )
     wrong = "drawn from a sealed seed: numbers and structure"
     return Reality("test", wrong, Randomization(**drawn), edit, timestep_s=0.005, is_sealed=True)
+
+
+REALITIES: dict[str, Callable[[], Reality]] = {"parametric": _parametric, "structural": _structural, "test": _sealed}
+"""What makes each of them, by name."""
 
 
 # ---- How a model differs -------------------------------------------------------------------------

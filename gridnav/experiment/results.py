@@ -11,14 +11,14 @@ import numpy as np
 
 from gridnav.display.recording import write_recording
 from gridnav.display.report import Picture, Report, Rung, Table, write_report
+from gridnav.display.words import percent
 from gridnav.envs import Randomization
 from gridnav.experiment.checkpoint import LIBRARIES, last_standing, load_agent
 from gridnav.experiment.evaluation import EVALUATION_SEED, HELD_OUT_LAYOUTS, evaluate_in
-from gridnav.experiment.live import Spectator
 from gridnav.experiment.pictures import pictures
 from gridnav.experiment.rollouts import Rollouts, save_rollouts
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory, read_json, write_json
-from gridnav.experiment.training import AgentKind, Budget, Choice, OnStage, Result, Workshop
+from gridnav.experiment.training import Job, OnStage, Result, Training, Workshop
 from gridnav.experiment.worlds import UNITS, Problem
 from gridnav.problem.metrics import Episode
 from gridnav.problem.types import InputError
@@ -155,54 +155,30 @@ def write_page(
     write_report(run.report, page)
 
 
-def train_and_report(
-    problem: Problem,
-    budget: Budget,
-    seed: int,
-    kinds: Sequence[AgentKind],
-    world: str,
-    choice: Choice,
-    run: RunDirectory,
-    command: str,
-    config: Mapping[str, Any],
-    on_stage: OnStage,
-    *,
-    checkpoint_s: float,
-    spectator: Spectator | None = None,
-    with_pictures: bool = True,
-) -> list[Result]:
+def train_and_report(job: Job, training: Training, *, with_pictures: bool = True) -> list[Result]:
     """Train agents in a world, evaluate them and write everything a run holds.
 
     Args:
-        problem: What is to be solved.
-        budget: How much may be spent.
-        seed: Of everything that is random in training.
-        kinds: Who learns; several are compared.
-        world: Where.
-        choice: Hyper-parameters and observation.
-        run: Where the files go; a run that was stopped goes on.
-        command: What makes the run again, for the report.
-        config: The run's configuration, for the report.
-        on_stage: Told of the trainings and evaluations.
-        checkpoint_s: Seconds between two checkpoints of a training.
-        spectator: Watches every training.
+        job: The run.
+        training: Who learns where.
         with_pictures: Draw figures, recording and report; without them the run has evaluation and rollouts alone.
     """
+    problem, run, seed, kinds, world = job.problem, job.run, job.seed, training.kinds, training.world
     with open_log(run) as log:
-        workshop = Workshop(problem, budget, seed, run, log, on_stage, checkpoint_s=checkpoint_s, spectator=spectator)
-        trained = [workshop.train(kind, kind, world, choice=choice) for kind in kinds]
+        workshop = Workshop(job, log)
+        trained = [workshop.train(kind, kind, world, choice=training.choice) for kind in kinds]
         results = [workshop.evaluate(one.name, one, world, one.name) for one in trained]
         write_evaluation(run, results, seed)
         if not with_pictures:
             for result in results:
                 save_rollouts(run.rollouts, kept(problem, result))
             return results
-        write_rollouts(run, problem, results, results, {"command": command, "training seed": seed})
+        write_rollouts(run, problem, results, results, {"command": job.command, "training seed": seed})
         shown = pictures(run, problem, results, trained, {kind: f"{kind} on {world}" for kind in kinds}, log)
     names, many = " and ".join(kinds), len(kinds) > 1
     found = [
-        f"{result.name} reaches the goal in {result.summary.success_rate:.1%} of {len(result.episodes)} episodes "
-        f"(95 % interval {result.summary.success_interval[0]:.1%} to {result.summary.success_interval[1]:.1%})"
+        f"{result.name} reaches the goal in {percent(result.summary.success_rate)} of {len(result.episodes)} episodes "
+        f"(95 % interval {' to '.join(map(percent, result.summary.success_interval))})"
         for result in results
     ]
     write_page(
@@ -212,8 +188,8 @@ def train_and_report(
         conclusion="; ".join(found) + ".",
         rows=report_rows(results, seed),
         shown=shown,
-        command=command,
-        config=config,
+        command=job.command,
+        config=job.config,
     )
     return results
 

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from gridnav.agents import Agent
+from gridnav.agents import Agent, Progress
 from gridnav.display.figures import kept_success
 from gridnav.display.report import Picture, Report, Table, write_report
+from gridnav.display.words import percent, percent_interval
 from gridnav.envs import Randomization
 from gridnav.experiment.checkpoint import load_agent
 from gridnav.experiment.evaluation import evaluate_in
@@ -22,6 +23,7 @@ from gridnav.experiment.reality import WORLD, Reality, find_reality
 from gridnav.experiment.results import stored_evaluation, write_evaluation, write_rollouts
 from gridnav.experiment.run_directory import RunDirectory, read_json, write_json
 from gridnav.experiment.training import OnStage, Result
+from gridnav.experiment.workers import in_workers
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.metrics import Summary, summarise
 from gridnav.problem.types import FloatArray, InputError
@@ -128,7 +130,7 @@ def measure(
 
 
 def measure_once(
-    runs: Mapping[str, RunDirectory], realities: Sequence[str], episodes: int, on_stage: OnStage
+    runs: Mapping[str, RunDirectory], realities: Sequence[str], episodes: int, on_stage: OnStage, *, jobs: int
 ) -> dict[str, Gap]:
     """The last policy of each run, at home and in realities; what an earlier call measured is read from the run.
 
@@ -136,22 +138,35 @@ def measure_once(
         runs: Finished runs by what their policies are called. Each belongs to the caller.
         realities: Names.
         episodes: Of each policy in each world.
-        on_stage: Told of every evaluation.
+        on_stage: Told of the evaluations.
+        jobs: How many policies at once.
     """
+    asked = {"realities": list(realities), "episodes": episodes}
+    left = [run.path for run in runs.values() if not _is_measured(run, asked)]
+    report = on_stage("policies in realities") if left else None
+    for number, _ in enumerate(in_workers(_measure_run, [(path, asked) for path in left], jobs), start=1):
+        if report:
+            report(Progress(number, len(left), {}))
     gaps = {}
     for name, run in runs.items():
-        file = run.path / MEASURED
-        asked = {"realities": list(realities), "episodes": episodes}
-        stored = read_json(file) if file.is_file() else {}
-        if any(stored.get(key) != value for key, value in asked.items()):
-            gap = measure([run], realities, episodes, on_stage)[-1]
-            there = {place: asdict(summary) for place, summary in gap.away.items()}
-            # As it will be read.
-            stored = json.loads(json.dumps(asked | {"home": asdict(gap.at_home), "away": there}))
-            write_json(file, stored)
+        stored = read_json(run.path / MEASURED)
         away = {place: _summary(one) for place, one in stored["away"].items()}
         gaps[name] = Gap(name, _summary(stored["home"]), away)
     return gaps
+
+
+def _is_measured(run: RunDirectory, asked: Mapping[str, Any]) -> bool:
+    file = run.path / MEASURED
+    stored = read_json(file) if file.is_file() else {}
+    return all(stored.get(key) == value for key, value in asked.items())
+
+
+def _measure_run(path: Path, asked: Mapping[str, Any]) -> None:
+    """In a worker: the last policy of a run, whose numbers go there."""
+    run = RunDirectory.open(path)
+    gap = measure([run], asked["realities"], asked["episodes"], lambda name: lambda progress: None)[-1]
+    there = {place: asdict(summary) for place, summary in gap.away.items()}
+    write_json(run.path / MEASURED, {**asked, "home": asdict(gap.at_home), "away": there})
 
 
 def _summary(stored: Mapping[str, Any]) -> Summary:
@@ -190,14 +205,22 @@ def keep(path: Path, episodes: Sequence[tuple[Problem, Result]], config: Mapping
         config: What was asked for.
 
     Raises:
-        InputError: When the folder is taken, or the episodes are in several mazes.
+        InputError: When the folder is taken.
     """
     problem, results = episodes[0][0], [result for _, result in episodes]
-    if any(other.layout != problem.layout for other, _ in episodes):
-        raise InputError("--keep takes runs of one maze: their episodes are shown in it")
     with RunDirectory.create(path, "realities", config) as run:
         write_evaluation(run, results, 0)
         write_rollouts(run, problem, results, results[-MOST_SHOWN:], {})
+
+
+def check_one_maze(runs: Sequence[RunDirectory]) -> None:
+    """Whether episodes of these runs can be shown together.
+
+    Raises:
+        InputError: When they are of several mazes.
+    """
+    if len({stored_evaluation(run)[0].layout for run in runs}) > 1:
+        raise InputError("--keep takes runs of one maze: their episodes are shown in it")
 
 
 def _log(run: RunDirectory, policy: str, summary: Summary) -> None:
@@ -293,9 +316,9 @@ def conclusion(gaps: Sequence[Gap]) -> str:
     for name in gaps[0].away:
         best, worst = (pick(gaps, key=_success_in(name)) for pick in (max, min))
         words = (
-            f"In the {name} reality {best.policy} has {best.away[name].success_rate:.1%} success "
-            f"({best.at_home.success_rate:.1%} at home), {worst.policy} {worst.away[name].success_rate:.1%} "
-            f"({worst.at_home.success_rate:.1%})"
+            f"In the {name} reality {best.policy} has {percent(best.away[name].success_rate)} success "
+            f"({percent(best.at_home.success_rate)} at home), {worst.policy} {percent(worst.away[name].success_rate)} "
+            f"({percent(worst.at_home.success_rate)})"
         )
         if len(gaps) > 1:
             found = correlation(home_and_away(gaps, name))
@@ -315,13 +338,12 @@ def table(gaps: Sequence[Gap]) -> Table:
     rows = []
     for gap in gaps:
         for name, summary in {"home": gap.at_home, **gap.away}.items():
-            low, high = summary.success_interval
             kept = ""
             if name != "home":
                 share, least, most = gap.retention(name)
                 kept = f"{share:.2f} ({least:.2f} to {most:.2f})"
-            success = f"{summary.success_rate:.1%} ({low:.1%} to {high:.1%})"
-            ratios = [f"{summary.spl:.2f}", f"{summary.collision_rate:.1%}"]
+            success = percent_interval(_with_interval(summary))
+            ratios = [f"{summary.spl:.2f}", percent(summary.collision_rate)]
             rows.append([gap.policy, name, success, kept, *ratios])
     return Table("What was kept", COLUMNS, rows, LEGEND)
 

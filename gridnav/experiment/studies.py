@@ -20,6 +20,10 @@ RANDOMIZED = "burger"
 """The randomization of studies that are not told another one."""
 UNDER = {"none": "none", "burger": "burger", "wide": "wide"}
 """Where agents of the presets are evaluated."""
+WHOLE = "whole"
+"""A training of its preset's length."""
+SHORT = {"none": (48_000, 144_000), "wide": (144_000, 432_000)}
+"""Steps of trainings that end early, so that there are policies of every quality whose success is to be foretold."""
 STRENGTHS = tuple(k / 4 for k in range(9))
 REACHES = (0.5, 1.0, 1.5, 2.0)
 """How far a quantity goes from its nominal value, as a share of the way to either end of its range."""
@@ -59,7 +63,8 @@ class Draft:
     settings: Settings
     """What tells it from the others, by column of the table."""
     fields: Mapping[str, Any]
-    """Its configuration, as far as the study decides it; all of it for ``evaluate``."""
+    """Its configuration, as far as the study decides it; all of it for ``evaluate``. What it says under ``set`` comes
+    after what the command line says there."""
     under: Mapping[str, str] = field(default_factory=dict)
     """See ``Trial``."""
 
@@ -75,15 +80,25 @@ def _plan_arms(wish: Wish) -> list[Draft]:
 
 
 def _plan_presets(wish: Wish) -> list[Draft]:
-    return [
-        _training({"randomization": preset, "seed": str(seed)}, preset, seed, UNDER)
-        for preset in RANDOMIZATION_PRESETS
+    whole = [_preset(preset, WHOLE, seed, ()) for preset in RANDOMIZATION_PRESETS for seed in wish.seeds]
+    short = [
+        _preset(preset, f"{steps} steps", seed, (f"steps={steps}",))
+        for preset, lengths in SHORT.items()
+        for steps in lengths
         for seed in wish.seeds
     ]
+    return whole + short
 
 
-def _training(settings: Settings, randomization: str, seed: int, under: Mapping[str, str]) -> Draft:
-    fields = {"agent": "ppo", "seed": str(seed), "randomization": randomization}
+def _preset(preset: str, training: str, seed: int, changes: tuple[str, ...]) -> Draft:
+    settings = {"randomization": preset, "training": training, "seed": str(seed)}
+    return _training(settings, preset, seed, UNDER, changes)
+
+
+def _training(
+    settings: Settings, randomization: str, seed: int, under: Mapping[str, str], changes: tuple[str, ...] = ()
+) -> Draft:
+    fields = {"agent": "ppo", "seed": str(seed), "randomization": randomization, "set": list(changes)}
     return Draft("train", settings, fields, under)
 
 

@@ -4,29 +4,18 @@ from __future__ import annotations
 
 import csv
 import io
-import os
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal
-
-import joblib
-from joblib.externals.loky.process_executor import TerminatedWorkerError
+from typing import Any
 
 from gridnav.experiment.run_directory import RESULT, RunDirectory, read_json, write_json, write_whole
 from gridnav.experiment.trials import Row, check_config, trial
+from gridnav.experiment.workers import Backend, check_backend, in_workers
 from gridnav.problem.types import InputError
 
 TABLE = "results.csv"
-Backend = Literal["local", "ray"]
-ROUND = 8
-"""Trials per job in a round on a cluster, at whose end the table is written."""
-WATCH_S = 0.2
-"""How often a worker looks whether its sweep is still alive."""
 
 
 @dataclass(frozen=True)
@@ -97,56 +86,17 @@ def carry_out(
 
     tell()
     left = [one for one in trials if one.number not in outcomes]
-    sweeper = os.getpid() if backend == "local" else None
-    work = [joblib.delayed(_attempt)(one, one.folder(sweep).resolve(), checkpoint_s, sweeper) for one in left]
-    with _workers(backend, jobs):
-        for one, outcome in _results(work, backend, jobs):
-            one.folder(sweep).mkdir(parents=True, exist_ok=True)  # a cluster's machine may have had one of its own
-            write_json(one.folder(sweep) / RESULT, vars(outcome))
-            outcomes[one.number] = outcome
-            tell()
+    work = [(one, one.folder(sweep).resolve(), checkpoint_s) for one in left]
+    for one, outcome in in_workers(_attempt, work, jobs, backend):
+        one.folder(sweep).mkdir(parents=True, exist_ok=True)  # a cluster's machine may have had one of its own
+        write_json(one.folder(sweep) / RESULT, vars(outcome))
+        outcomes[one.number] = outcome
+        tell()
     return [outcomes[one.number] for one in trials]
 
 
-def check_backend(backend: Backend) -> None:
-    """Whether trials can be done there.
-
-    Raises:
-        InputError: When it is not installed.
-    """
-    if backend == "ray" and find_spec("ray") is None:
-        raise InputError("--backend ray needs Ray, which is not installed: uv pip install ray, or leave --backend out")
-
-
-@contextmanager
-def _workers(backend: Backend, jobs: int) -> Iterator[None]:
-    if backend == "ray":
-        from ray.util.joblib import register_ray
-
-        register_ray()
-    # One thread of arithmetic each: the networks are small, and the number of threads decides the last bit.
-    how: dict[str, Any] = {"backend": "ray"} if backend == "ray" else {"backend": "loky", "inner_max_num_threads": 1}
-    try:
-        with joblib.parallel_config(n_jobs=jobs, **how):
-            yield
-    except TerminatedWorkerError:
-        raise OSError("a worker died, perhaps for want of memory: --resume goes on, with fewer --jobs if so") from None
-
-
-def _results(work: Sequence[Any], backend: Backend, jobs: int) -> Iterator[tuple[Trial, Outcome]]:
-    """What workers give back, as soon as it is there."""
-    if backend == "local":
-        yield from joblib.Parallel(return_as="generator_unordered", batch_size=1)(work)
-        return
-    # Joblib's Ray backend gives nothing back before all is done: in rounds the table grows meanwhile.
-    for begin in range(0, len(work), ROUND * jobs):
-        yield from joblib.Parallel(batch_size=1)(work[begin : begin + ROUND * jobs])
-
-
-def _attempt(one: Trial, folder: Path, checkpoint_s: float, sweeper: int | None) -> tuple[Trial, Outcome]:
+def _attempt(one: Trial, folder: Path, checkpoint_s: float) -> tuple[Trial, Outcome]:
     """A trial in a worker; what speaks against the trial is an outcome, what speaks against the machine is raised."""
-    if sweeper is not None:
-        _end_with(sweeper)
     began = time.perf_counter()
     try:
         rows, error = trial(one.config, folder, checkpoint_s, one.under), ""
@@ -155,19 +105,6 @@ def _attempt(one: Trial, folder: Path, checkpoint_s: float, sweeper: int | None)
     except Exception as failure:  # one bad trial must not take the others down
         rows, error = [], f"{type(failure).__name__}: {' '.join(str(failure).split())[:300]}"
     return one, Outcome(rows, error, round(time.perf_counter() - began, 3))
-
-
-def _end_with(sweeper: int) -> None:
-    """Let this worker end when its sweep is gone: killed, that cannot say goodbye, and workers would go on alone."""
-
-    def watch() -> None:
-        while os.getppid() == sweeper:
-            time.sleep(WATCH_S)
-        os._exit(1)
-
-    name = "gridnav-watch"
-    if os.getpid() != sweeper and all(thread.name != name for thread in threading.enumerate()):
-        threading.Thread(target=watch, name=name, daemon=True).start()
 
 
 # ---- Files -------------------------------------------------------------------------------------------

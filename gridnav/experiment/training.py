@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from gridnav.agents import Agent, OnProgress, Planner, QLearning
 from gridnav.display.policy_map import PolicyMap
@@ -73,6 +73,51 @@ class Choice:
             varied = "randomized" if problem.randomization.names else "default"
             return "layouts" if problem.family else "any" if problem.task.goals == "any" else varied
         return self.observation if self.observation != "cell_goal" else "default"
+
+
+@dataclass(frozen=True)
+class Training:
+    """Who learns where, of one run."""
+
+    kinds: Sequence[AgentKind]
+    """Who learns; several are compared."""
+    world: str
+    """Where: ``GridWorld``, ``Unicycle`` or ``DiffDrive``."""
+    choice: Choice
+    """Hyper-parameters and observation."""
+
+    @classmethod
+    def of(cls, config: Mapping[str, Any], problem: Problem) -> Self:
+        """From the configuration of a run.
+
+        Args:
+            config: As in the run's ``config.json``.
+            problem: What it describes.
+
+        Raises:
+            InputError: When something in it is unknown, not possible or does not go together.
+        """
+        choice = Choice(config["preset"], _changes(config["set"]), config["observation"])
+        agent = config["agent"]
+        all_of_them: list[AgentKind] = [kind for kind, seen in OBSERVATIONS.items() if choice.observation in seen]
+        kinds = all_of_them if agent == "all" else [agent]
+        home = "gridnav/DiffDrive-v0" if agent == "ppo" else "gridnav/GridWorld-v0"
+        world = config.get("env", home).split("/")[1].removesuffix("-v0")
+        check_choice(kinds, problem, world, choice)
+        if world == "GridWorld" and problem.randomization.names:
+            raise InputError("--randomization varies robots, and the grid has none: leave it out or give another --env")
+        return cls(kinds, world, choice)
+
+
+def _changes(pairs: Sequence[str]) -> dict[str, str]:
+    """Hyper-parameters by name, from pairs such as ``batch_size=64``."""
+    changes = {}
+    for pair in pairs:
+        name, equals, value = pair.partition("=")
+        if not equals or name == "seed":
+            raise InputError(f"--set {pair!r:.60} must be name=value, and the seed is --seed")
+        changes[name] = value
+    return changes
 
 
 @dataclass(frozen=True)
@@ -155,6 +200,30 @@ OnStage = Callable[[str], OnProgress]
 """Told what begins, in words; gives what is to be told of its progress."""
 
 
+@dataclass(frozen=True)
+class Job:
+    """A run to be made: of what, with how much, where, and who is told."""
+
+    problem: Problem
+    """What is to be solved."""
+    budget: Budget
+    """How much may be spent."""
+    seed: int
+    """Of everything that is random in training."""
+    run: RunDirectory
+    """Where files go; whoever makes the job owns it. A run that was stopped goes on."""
+    on_stage: OnStage
+    """Told of every training and evaluation."""
+    config: Mapping[str, Any] = field(default_factory=dict)
+    """The run's configuration, for its report."""
+    command: str = ""
+    """What makes the run again, for its report."""
+    checkpoint_s: float = CHECKPOINT_S
+    """Seconds between two checkpoints of a training; 0 makes one at every opportunity."""
+    spectator: Spectator | None = None
+    """Watches every training."""
+
+
 class Workshop:
     """Trains and evaluates the agents of one run, and keeps their checkpoints and metrics.
 
@@ -162,31 +231,13 @@ class Workshop:
     continued bit for bit, the rest is done as ever.
 
     Args:
-        problem: What is to be solved.
-        budget: How much may be spent.
-        seed: Of everything that is random in training.
-        run: Where files go; whoever makes the workshop owns it.
+        job: What is to be made.
         log: Where metrics go.
-        on_stage: Told of every training and evaluation.
-        checkpoint_s: Seconds between two checkpoints of a training; 0 makes one at every opportunity.
-        spectator: Watches every training.
     """
 
-    def __init__(
-        self,
-        problem: Problem,
-        budget: Budget,
-        seed: int,
-        run: RunDirectory,
-        log: MetricsLog,
-        on_stage: OnStage,
-        *,
-        checkpoint_s: float = CHECKPOINT_S,
-        spectator: Spectator | None = None,
-    ) -> None:
-        self._spectator = spectator
-        self.problem, self.budget, self.seed = problem, budget, seed
-        self._run, self._log, self._on_stage, self._checkpoint_s = run, log, on_stage, checkpoint_s
+    def __init__(self, job: Job, log: MetricsLog) -> None:
+        self.problem, self.budget, self.seed = job.problem, job.budget, job.seed
+        self._job, self._run, self._log, self._on_stage = job, job.run, log, job.on_stage
         self._run_steps = 0
 
     def train(
@@ -235,23 +286,14 @@ class Workshop:
         if carry.teacher is not None:
             agent.teacher = carry.teacher  # type: ignore[attr-defined]
         validation = make_validation(self.problem, agent, world, steps, self.budget, saved)
-        watch = self._spectator.watch(name, world, choice.observation) if self._spectator else None
+        spectator = self._job.spectator
+        watch = spectator.watch(name, world, choice.observation) if spectator else None
         judged = self.problem.for_evaluation
         curve = GreedyCurve(judged.worlds(world, CURVE_EPISODES), steps) if with_curve else None
         course = Course(
-            name,
-            agent,
-            worlds,
-            validation,
-            before,
-            saved,
-            self._run,
-            self._log,
-            report,
-            self._checkpoint_s,
-            watch,
+            name, agent, worlds, validation, before, saved, self._run, self._log, report, self._job.checkpoint_s, watch,
             curve,
-        )
+        )  # fmt: skip
         end = course.go(steps)
         for used in (worlds, validation, curve):
             if used is not None:

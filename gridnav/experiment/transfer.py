@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from gridnav.display.figures import comparison, save_figure
 from gridnav.display.report import Picture, Report, Table, write_report
+from gridnav.display.words import percent, thousands
 from gridnav.experiment.across_seeds import OWN_TO_A_SEED
 from gridnav.experiment.arms import ARMS
 from gridnav.experiment.greedy_curve import CURVE_EPISODES, SUCCESS
@@ -21,20 +22,21 @@ from gridnav.problem.transfer import THRESHOLD, Estimate, Learnt, Transfer, tran
 from gridnav.problem.types import InputError
 
 SCRATCH = "scratch"
+LEARNT = percent(THRESHOLD, 0)
 QUESTION = "What does a robot save that begins with what was learnt on an easier rung?"
 CAPTION = (
     f"Success of the greedy policies on the target, {CURVE_EPISODES} episodes of a seed of their own, against "
     "environment steps there."
 )
 LEGEND = (
-    f"Steps are the target's. To {THRESHOLD:.0%}: the first point of the curve that is there for good, the mean over "
+    f"Steps are the target's. To {LEARNT}: the first point of the curve that is there for good, the mean over "
     "the tenth of the training that follows being there too; a seed that never gets there counts with all its steps. "
     "Jumpstart and transfer ratio (area under the curve) are against scratch, the asymptote is the mean of the last "
     "quarter. Sources are what an arm builds on, whatever their world. Interquartile means over seeds with 95 % "
     "bootstrap intervals; with one seed there are none."
 )
 COLUMNS = (
-    "arm", "jumpstart", f"steps to {THRESHOLD:.0%}", "of scratch's", "with sources", "time", "with sources",
+    "arm", "jumpstart", f"steps to {LEARNT}", "of scratch's", "with sources", "time", "with sources",
     "asymptote", "transfer ratio",
 )  # fmt: skip
 
@@ -71,9 +73,9 @@ class TransferReport:
         share = "" if arm.steps_ratio is None else f", {_number(arm.steps_ratio, '.2f')} of them"
         harm = [f"{name} ({', '.join(one.negative)})" for name, one in self.arms.items() if one.negative]
         return (
-            f"On {self.target}, {n_seeds}, learning from scratch needs {_steps(scratch)} to {THRESHOLD:.0%} success, "
+            f"On {self.target}, {n_seeds}, learning from scratch needs {_steps(scratch)} to {LEARNT} success, "
             f"and {self.best}, the quickest arm, {_steps(arm)}{share}, with a jumpstart of "
-            f"{_number(arm.jumpstart, '+.2f')}, and {_count(arm.total_steps.value)} steps if those of its sources "
+            f"{_number(arm.jumpstart, '+.2f')}, and {thousands(arm.total_steps.value)} steps if those of its sources "
             "count, whatever their world; "
             + (f"transfer was negative for {', '.join(harm)}." if harm else "no arm was worse than scratch.")
         )
@@ -197,7 +199,7 @@ def _row(name: str, arm: Transfer) -> list[str]:
         _number(arm.jumpstart, "+.2f"),
         _steps(arm),
         "-" if arm.steps_ratio is None else _number(arm.steps_ratio, ".2f"),
-        _count(arm.total_steps.value),
+        thousands(arm.total_steps.value),
         f"{arm.seconds.value:.0f} s",
         f"{arm.total_seconds.value:.0f} s",
         _number(arm.asymptote, ".3f"),
@@ -208,7 +210,7 @@ def _row(name: str, arm: Transfer) -> list[str]:
 def _steps(arm: Transfer) -> str:
     reached = "" if arm.n_reached == arm.n_seeds else f", {arm.n_reached} of {arm.n_seeds} seeds got there"
     least = "" if arm.n_reached == arm.n_seeds else "at least "
-    return f"{least}{_count(arm.steps.value)} steps{reached}"
+    return f"{least}{thousands(arm.steps.value)} steps{reached}"
 
 
 def _number(estimate: Estimate, form: str) -> str:
@@ -216,8 +218,3 @@ def _number(estimate: Estimate, form: str) -> str:
     if estimate.low == estimate.high:
         return value
     return f"{value} ({format(estimate.low, form)} to {format(estimate.high, form)})"
-
-
-def _count(number: float) -> str:
-    # A narrow no-break space: the number stays on one line.
-    return f"{round(number):,}".replace(",", "\u202f")

@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Any
 
 from gridnav.experiment.checkpoint import clear_leftovers
 from gridnav.experiment.course import CHECKPOINT_S
 from gridnav.experiment.run_directory import RunDirectory, write_json
-from gridnav.experiment.training import (
-    BUDGETS,
-    OBSERVATIONS,
-    AgentKind,
-    Budget,
-    Choice,
-    Result,
-    check_choice,
-)
+from gridnav.experiment.training import BUDGETS, Job, Result, Training
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.types import InputError
 
@@ -33,47 +24,6 @@ PATIENCE_S = 30.0
 """How long a trial waits for a process that still works on it, whose sweep was killed."""
 
 
-@dataclass(frozen=True)
-class Training:
-    """What ``gridnav train`` is asked for."""
-
-    problem: Problem
-    """What is to be solved."""
-    budget: Budget
-    """How much may be spent."""
-    seed: int
-    """Of everything that is random in training."""
-    kinds: Sequence[AgentKind]
-    """Who learns; several are compared."""
-    world: str
-    """Where: ``GridWorld``, ``Unicycle`` or ``DiffDrive``."""
-    choice: Choice
-    """Hyper-parameters and observation."""
-
-    @classmethod
-    def of(cls, config: Mapping[str, Any], problem: Problem | None = None) -> Self:
-        """From the configuration of a run.
-
-        Args:
-            config: As in the run's ``config.json``.
-            problem: What it describes, if that is made already.
-
-        Raises:
-            InputError: When something in it is unknown, not possible or does not go together.
-        """
-        problem = problem or problem_of(config)
-        choice = Choice(config["preset"], _changes(config["set"]), config["observation"])
-        agent = config["agent"]
-        all_of_them: list[AgentKind] = [kind for kind, seen in OBSERVATIONS.items() if choice.observation in seen]
-        kinds = all_of_them if agent == "all" else [agent]
-        home = "gridnav/DiffDrive-v0" if agent == "ppo" else "gridnav/GridWorld-v0"
-        world = config.get("env", home).split("/")[1].removesuffix("-v0")
-        check_choice(kinds, problem, world, choice)
-        if world == "GridWorld" and problem.randomization.names:
-            raise InputError("--randomization varies robots, and the grid has none: leave it out or give another --env")
-        return cls(problem, BUDGETS[config["budget"]], config["seed"], kinds, world, choice)
-
-
 def problem_of(config: Mapping[str, Any]) -> Problem:
     """The problem that a run's configuration describes.
 
@@ -81,17 +31,6 @@ def problem_of(config: Mapping[str, Any]) -> Problem:
         InputError: When a part of it is unknown or wrong.
     """
     return Problem.load(config["layout"], config["task"], config["reward"], config.get("randomization", "none"))
-
-
-def _changes(pairs: Sequence[str]) -> dict[str, str]:
-    """Hyper-parameters by name, from pairs such as ``batch_size=64``."""
-    changes = {}
-    for pair in pairs:
-        name, equals, value = pair.partition("=")
-        if not equals or name == "seed":
-            raise InputError(f"--set {pair!r:.60} must be name=value, and the seed is --seed")
-        changes[name] = value
-    return changes
 
 
 def trial(
@@ -154,11 +93,8 @@ def check_config(run: RunDirectory, config: Mapping[str, Any]) -> None:
 def _train(config: Mapping[str, Any], run: RunDirectory, checkpoint_s: float) -> list[Result]:
     from gridnav.experiment.results import train_and_report
 
-    job = Training.of(config)
-    return train_and_report(
-        job.problem, job.budget, job.seed, job.kinds, job.world, job.choice, run, "", config, _unseen,
-        checkpoint_s=checkpoint_s, with_pictures=False,
-    )  # fmt: skip
+    problem = problem_of(config)
+    return train_and_report(_job(config, problem, run, checkpoint_s), Training.of(config, problem), with_pictures=False)
 
 
 def _ladder(config: Mapping[str, Any], run: RunDirectory, checkpoint_s: float) -> list[Result]:
@@ -166,11 +102,13 @@ def _ladder(config: Mapping[str, Any], run: RunDirectory, checkpoint_s: float) -
     from gridnav.experiment.ladder import climb, compare
 
     run.figures.mkdir(exist_ok=True)
-    problem, budget, seed = problem_of(config), BUDGETS[config["budget"]], config["seed"]
-    how: dict[str, Any] = {"checkpoint_s": checkpoint_s}
-    if "arms" in config:
-        return compare(problem, budget, seed, choose_arms(config["arms"]), run, "", config, _unseen, **how)
-    return climb(problem, budget, seed, run, "", config, _unseen, **how)
+    job = _job(config, problem_of(config), run, checkpoint_s)
+    return compare(job, choose_arms(config["arms"])) if "arms" in config else climb(job)
+
+
+def _job(config: Mapping[str, Any], problem: Problem, run: RunDirectory, checkpoint_s: float) -> Job:
+    budget = BUDGETS[config["budget"]]
+    return Job(problem, budget, config["seed"], run, _unseen, config, checkpoint_s=checkpoint_s)
 
 
 def _evaluate(config: Mapping[str, Any], run: RunDirectory, checkpoint_s: float) -> list[Result]:

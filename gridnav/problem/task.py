@@ -65,6 +65,13 @@ class Task:
         """Cells where an episode may end, (row, column), shape ``(n_goals, 2)``."""
         return np.argwhere(layout.reachable) if self.goals == "any" else layout.goal_cells
 
+    def goal_ranks(self, layout: Layout) -> IntArray:
+        """Place of each cell among the goals, -1 where it is none, shape ``(n_rows, n_cols)``."""
+        goals = self.goal_cells(layout)
+        ranks = np.full(layout.walls.shape, -1)
+        ranks[tuple(goals.T)] = np.arange(len(goals))
+        return ranks
+
     def sample(self, layout: Layout, uniforms: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
         """Starts, goals and headings of episodes; see ``EpisodeSampler.sample``."""
         return EpisodeSampler(self, layout).sample(uniforms)
@@ -82,8 +89,7 @@ class EpisodeSampler:
         self._starts, self._goals = task.start_cells(layout), task.goal_cells(layout)
         if len(self._goals) == 1:  # a start that leaves no goal to go to is none
             self._starts = self._starts[(self._starts != self._goals[0]).any(axis=1)]
-        self._goal_rank = np.full(layout.walls.shape, len(self._goals))
-        self._goal_rank[tuple(self._goals.T)] = np.arange(len(self._goals))
+        self._goal_ranks = task.goal_ranks(layout)
 
     def sample(self, uniforms: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
         """Starts, goals and headings of episodes.
@@ -96,7 +102,7 @@ class EpisodeSampler:
         """
         n = len(uniforms)
         starts, goals, headings = np.empty((n, 2), dtype=np.int64), np.empty((n, 2), dtype=np.int64), np.empty(n)
-        _sample(uniforms, self._starts, self._goals, self._goal_rank, starts, goals, headings)
+        _sample(uniforms, self._starts, self._goals, self._goal_ranks, starts, goals, headings)
         return starts, goals, headings
 
 
@@ -105,7 +111,7 @@ def _sample(
     uniforms: FloatArray,
     start_cells: IntArray,
     goal_cells: IntArray,
-    goal_rank: IntArray,
+    goal_ranks: IntArray,
     starts: IntArray,
     goals: IntArray,
     headings: FloatArray,
@@ -114,11 +120,11 @@ def _sample(
         # Start: uniform over the start cells.
         row, col = start_cells[int(uniforms[i, 0] * len(start_cells))]
         # Goal: uniform over the goal cells that are not the start.
-        own = goal_rank[row, col]
-        choices = len(goal_cells) - (1 if own < len(goal_cells) else 0)
+        own = goal_ranks[row, col]
+        choices = len(goal_cells) - (1 if own >= 0 else 0)
         drawn = int(uniforms[i, 1] * choices)
         starts[i, 0], starts[i, 1] = row, col
-        goals[i] = goal_cells[drawn + 1 if drawn >= own else drawn]
+        goals[i] = goal_cells[drawn + 1 if 0 <= own <= drawn else drawn]
         # Heading: uniform over the circle.
         headings[i] = (2.0 * uniforms[i, 2] - 1.0) * np.pi
 

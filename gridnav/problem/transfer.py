@@ -173,7 +173,7 @@ def _worse(gain: Estimate, steps_ratio: Estimate | None, ratio: Estimate | None)
     if steps_ratio and steps_ratio.low > 1.0 and steps_ratio.value > SLOWER:
         yield f"{steps_ratio.value:.1f} times the steps"
     if ratio and ratio.high < 0.0 and ratio.value < -WORSE_SHARE:
-        yield f"an area {-ratio.value:.0%} smaller"
+        yield f"an area {-100 * ratio.value:.0f} % smaller"
 
 
 def _estimate(scores: Sequence[Sequence[float]], compare: Callable[..., FloatArray]) -> Estimate:
