@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from gridnav.experiment.across_seeds import AcrossSeeds
     from gridnav.experiment.arms import Arm
     from gridnav.experiment.live import Spectator
-    from gridnav.experiment.sweep import Outcome, Trial
+    from gridnav.experiment.sweeps.sweep import Outcome, Trial
 
 Config = TypeVar("Config")
 stderr = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -280,7 +280,7 @@ class Sweep:
 
     def __call__(self) -> int:
         """Run it."""
-        from gridnav.experiment.sweep import TABLE, carry_out
+        from gridnav.experiment.sweeps.sweep import TABLE, carry_out
         from gridnav.experiment.workers import check_backend
 
         jobs = cpu_count() if self.jobs is None else self.jobs
@@ -298,7 +298,7 @@ class Sweep:
         _show_sweep(trials, outcomes)
         stdout.print(f"table      {run.path / TABLE}")
         if self.study:
-            from gridnav.experiment.findings import write_study
+            from gridnav.experiment.sweeps.findings import write_study
 
             with _progress() as on_stage:
                 sentence = write_study(
@@ -309,8 +309,8 @@ class Sweep:
 
     def _plan(self) -> tuple[list[Trial], dict[str, Any]]:
         """The trials, each checked as its command would, and the configuration of them all."""
-        from gridnav.experiment.design import settings_of
-        from gridnav.experiment.sweep import Trial
+        from gridnav.experiment.sweeps.design import settings_of
+        from gridnav.experiment.sweeps.sweep import Trial
 
         if not self.grid and not self.random:
             raise InputError("a sweep needs something to vary: --grid seed=0,1,2, --random FIELD=LAW or --study NAME")
@@ -327,8 +327,8 @@ class Sweep:
 
     def _study(self) -> tuple[list[Trial], dict[str, Any]]:
         """The same of a study."""
-        from gridnav.experiment.studies import EVALUATING, Wish, plan
-        from gridnav.experiment.sweep import Trial
+        from gridnav.experiment.sweeps.studies import EVALUATING, Wish, plan
+        from gridnav.experiment.sweeps.sweep import Trial
 
         self._leave_out("grid", "random", "n_trials", "design_seed", "trial", because="goes without --study")
         evaluates = self.study in EVALUATING

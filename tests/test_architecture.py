@@ -122,6 +122,14 @@ def test_imports_between_files_make_no_circle() -> None:
         pytest.fail(" imports ".join(reversed(error.args[1])))
 
 
+def test_only_the_command_line_knows_sweeps() -> None:
+    """A trial is what a command does: nothing that a trial is made of may ask what it is a trial of."""
+    room = "gridnav.experiment.sweeps"
+    users = {module for module, found in OWN_IMPORTS.items() if any(name.startswith(room) for name in found)}
+
+    assert {module for module in users if not module.startswith(room)} == {"gridnav.cli"}
+
+
 @pytest.mark.parametrize("library", ONLY_IN)
 def test_a_library_is_known_to_its_one_module_alone(library: str) -> None:
     users = {module for module, found in IMPORTS.items() if library in {name.split(".")[0] for name in found}}

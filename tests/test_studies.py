@@ -13,11 +13,11 @@ from matplotlib import pyplot as plt
 from gridnav.agents import PPO_PRESETS, Progress
 from gridnav.display.responses import Panel, Response, responses
 from gridnav.envs import PARAMETERS, RANDOMIZATION_PRESETS, Randomization
-from gridnav.experiment.findings import write_study
 from gridnav.experiment.run_directory import RunDirectory, write_json
 from gridnav.experiment.sim_to_real import MEASURED
-from gridnav.experiment.studies import GROUPS, Draft, Wish, plan
-from gridnav.experiment.sweep import Outcome, Trial
+from gridnav.experiment.sweeps.findings import write_study
+from gridnav.experiment.sweeps.studies import GROUPS, Draft, Wish, plan
+from gridnav.experiment.sweeps.sweep import Outcome, Trial
 from gridnav.problem.metrics import Summary
 from gridnav.problem.types import InputError
 

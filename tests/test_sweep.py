@@ -15,9 +15,9 @@ import pytest
 from command_line import run_cli
 from joblib.externals.loky import get_reusable_executor
 
-from gridnav.experiment.design import settings_of
 from gridnav.experiment.run_directory import RunDirectory, RunInUseError
-from gridnav.experiment.trials import trial
+from gridnav.experiment.sweeps.design import settings_of
+from gridnav.experiment.sweeps.trials import trial
 from gridnav.experiment.workers import WATCH_S, _end_with
 from gridnav.problem.types import InputError
 

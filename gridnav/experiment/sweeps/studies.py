@@ -11,8 +11,8 @@ from typing import Any
 
 from gridnav.envs import PARAMETERS, RANDOMIZATION_PRESETS, Randomization
 from gridnav.experiment.arms import ARMS
-from gridnav.experiment.design import Settings
 from gridnav.experiment.run_directory import RunDirectory
+from gridnav.experiment.sweeps.design import Settings
 from gridnav.experiment.transfer import SCRATCH
 from gridnav.problem.types import InputError
 

@@ -18,11 +18,11 @@ from gridnav.envs import PARAMETERS, Randomization
 from gridnav.experiment.across_seeds import labels_of
 from gridnav.experiment.run_directory import RunDirectory
 from gridnav.experiment.sim_to_real import Gap, correlation, measure_once
-from gridnav.experiment.studies import EVERYTHING, NOTHING, PARTS, UNDER, WHOLE
-from gridnav.experiment.sweep import Outcome, Trial
+from gridnav.experiment.sweeps.studies import EVERYTHING, NOTHING, PARTS, UNDER, WHOLE
+from gridnav.experiment.sweeps.sweep import Outcome, Trial
+from gridnav.experiment.sweeps.trials import Row
 from gridnav.experiment.training import BUDGETS, OnStage
 from gridnav.experiment.transfer import transfer_report, write_transfer
-from gridnav.experiment.trials import Row
 from gridnav.problem.metrics import Summary
 from gridnav.problem.statistics import iqm, stratified_bootstrap
 from gridnav.problem.types import InputError

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gridnav.experiment.run_directory import RESULT, RunDirectory, read_json, write_json, write_whole
-from gridnav.experiment.trials import Row, check_config, trial
+from gridnav.experiment.sweeps.trials import Row, check_config, trial
 from gridnav.experiment.workers import Backend, check_backend, in_workers
 from gridnav.problem.types import InputError
 
