@@ -40,6 +40,42 @@ OnCut = Callable[[Callable[[], State]], None]
 """Called wherever training may be cut in two, with what makes the state of training there. It may raise to end it."""
 
 
+Act = Callable[[NDArray[Any]], NDArray[Any]]
+"""Observations of a batch to its actions."""
+
+
+class FrameStack:
+    """The last observations of every robot of a batch, the newest first: what an agent sees that remembers.
+
+    Before an episode's first observation there was always the same one.
+
+    Args:
+        size: Observations of each robot.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self.frames: NDArray[Any] = np.empty((0, size, 0))
+        """Shape ``(n, size, n_numbers)``."""
+
+    def begin(self, observations: NDArray[Any]) -> NDArray[Any]:
+        """Forget all, where episodes begin with observations of shape ``(n, n_numbers)``; gives what is seen."""
+        self.frames = np.repeat(observations[:, None], self.size, axis=1)
+        return self.seen
+
+    def push(self, observations: NDArray[Any], begun: NDArray[np.bool_] | None = None) -> NDArray[Any]:
+        """Remember what is observed one step later; ``begun`` names the robots whose next episode begins with it."""
+        self.frames = np.concatenate([observations[:, None], self.frames[:, :-1]], axis=1)
+        if begun is not None and begun.any():
+            self.frames[begun] = observations[begun, None]
+        return self.seen
+
+    @property
+    def seen(self) -> NDArray[Any]:
+        """All that is remembered, shape ``(n, size * n_numbers)``."""
+        return self.frames.reshape(len(self.frames), -1)
+
+
 class Agent(ABC):
     """Knows Gymnasium spaces, never a world; observations and actions carry a leading batch axis."""
 
@@ -49,6 +85,10 @@ class Agent(ABC):
     @abstractmethod
     def act(self, observations: NDArray[Any]) -> NDArray[Any]:
         """Greedy actions for a batch of observations, shape ``(n, ...)`` both."""
+
+    def begin(self) -> Act:
+        """What acts in the episodes of a batch from their beginning on, asked once a step; it may remember."""
+        return self.act
 
     @abstractmethod
     def values(self, observations: NDArray[Any]) -> NDArray[Any]:

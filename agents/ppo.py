@@ -28,12 +28,16 @@ from torch.distributions import Normal, kl_divergence
 
 from gridnav.problem.types import InputError, State
 
-from .base import Agent, EpisodeWindow, OnCut, OnProgress, Progress, check_finite, reached
+from .base import Act, Agent, EpisodeWindow, FrameStack, OnCut, OnProgress, Progress, check_finite, reached
 from .hyper_parameters import check_numbers
 from .torch_state import guard_gradients, load_optimizer_arrays, optimizer_arrays
 
 POSE = (27, 28, 29, 30)
 """Where the robots' feature vector holds position and heading in the maze."""
+LONGEST_STACK = 32
+"""Observations that a network can see."""
+INPUTS = ("features_extractor.seen", "features_extractor.is_length")
+"""Ends of the names of what says how inputs are looked at."""
 ACTOR = ("mlp_extractor.policy_net", "action_net", "log_std")
 """Beginnings of the names of the parameters that decide on actions; the value network has layers of its own."""
 
@@ -80,6 +84,9 @@ class PPOConfig:
     """Units of the hidden layers (tanh) of policy and value network."""
     ignored: tuple[int, ...] = ()
     """Numbers of the observation that the networks never see, such as ``POSE``, lest they learn a maze by heart."""
+    stack_size: int = 1
+    """Observations that the networks see, the last ones. Where commands take effect late and scans arrive late, one
+    observation does not say what the robot is about to do."""
     reward_scale: float = 1.0
     """Factor on the rewards the learner sees: it keeps the value network's gradient from crowding out the policy's."""
     exploring_starts: float = 0.3
@@ -107,6 +114,8 @@ class PPOConfig:
             raise InputError(f"hidden {self.hidden!r:.60} of PPOConfig must be whole numbers of at least 1")
         if not all(isinstance(number, int) and number >= 0 for number in self.ignored):
             raise InputError(f"ignored {self.ignored!r:.60} of PPOConfig must be whole numbers of at least 0")
+        if not 1 <= self.stack_size <= LONGEST_STACK:
+            raise InputError(f"stack_size {self.stack_size} of PPOConfig is outside 1 to {LONGEST_STACK}")
         if self.batch_size < 2 or self.num_envs * self.n_steps < 2:  # advantages are normalised over a batch
             raise InputError(f"batch_size {self.batch_size} of PPOConfig must be at least 2, and so must a rollout")
 
@@ -120,7 +129,7 @@ PPO_PRESETS: dict[str, PPOConfig] = {
     ),
     "layouts": PPOConfig(steps=1_500_000, hidden=(64, 64), ignored=POSE),
     # Three times the default's steps: a world that varies has more to learn.
-    "randomized": PPOConfig(steps=1_440_000),
+    "randomized": PPOConfig(steps=1_440_000, stack_size=3),
 }
 """By what they were made for: DiffDrive on ``classic``, the same with a network that learnt elsewhere, any start to
 any goal, layouts never seen in training, where no pose is worth knowing, and robots that vary; docs/ppo.md has what
@@ -153,23 +162,63 @@ class PPOAgent(Agent):
         torch.set_num_threads(1)
         torch.manual_seed(config.seed)
         self.policy = ActorCriticPolicy(
-            observation_space,
+            _stacked(observation_space, config.stack_size),
             action_space,
             lr_schedule=lambda _: config.learning_rate,
-            **_policy_options(config),
+            **_policy_options(config, observation_space),
         )
         with torch.no_grad():
             self.policy.get_parameter("action_net.bias")[0] = config.initial_forward
 
     def act(self, observations: NDArray[Any]) -> NDArray[Any]:
-        """The policy's mean commands, clipped to the action space."""
-        return self.policy.predict(observations, deterministic=True)[0]
+        """The policy's mean commands, clipped to the action space.
+
+        Args:
+            observations: The last one of each robot, as if it had always been there, or all that is stacked.
+        """
+        return self.policy.predict(self._stack(observations), deterministic=True)[0]
+
+    def begin(self) -> Act:
+        """The same with a memory of the observations before."""
+        if self.config.stack_size == 1:
+            return self.act
+        stack = FrameStack(self.config.stack_size)
+
+        def act(observations: NDArray[Any]) -> NDArray[Any]:
+            return self.act(stack.push(observations) if len(stack.frames) else stack.begin(observations))
+
+        return act
 
     def values(self, observations: NDArray[Any]) -> NDArray[Any]:
-        """What the value network expects, in the reward's own unit, shape ``(n,)``."""
+        """What the value network expects, in the reward's own unit, shape ``(n,)``; see ``act`` for observations."""
         with torch.no_grad():
-            values = self.policy.predict_values(torch.as_tensor(observations)).numpy().ravel()
+            values = self.policy.predict_values(torch.as_tensor(self._stack(observations))).numpy().ravel()
         return values / self.config.reward_scale
+
+    def _stack(self, observations: NDArray[Any]) -> NDArray[Any]:
+        size = self.config.stack_size
+        is_one = size > 1 and observations.shape[1] == self._observation_space.shape[0]
+        return FrameStack(size).begin(observations) if is_one else observations
+
+    def take_weights(self, source: PPOAgent) -> None:
+        """Begin with the networks of another agent; where this one sees more observations, those count for nothing yet.
+
+        Raises:
+            InputError: When the networks are of another size.
+        """
+        theirs = source.policy.state_dict()
+        own = self.policy.state_dict()
+        for name, weights in own.items():
+            given = theirs.get(name, torch.empty(0))
+            if given.shape == weights.shape:
+                own[name] = given.clone()
+            elif name.endswith(INPUTS):
+                continue  # what the inputs are is said by the space
+            elif given.dim() == 2 and len(given) == len(weights) and given.shape[1] < weights.shape[1]:
+                own[name] = torch.nn.functional.pad(given, (0, weights.shape[1] - given.shape[1]))
+            else:
+                raise InputError(f"{name} of shape {tuple(given.shape)} cannot be carried to {tuple(weights.shape)}")
+        self.policy.load_state_dict(own)
 
     @property
     def planned_steps(self) -> int:
@@ -187,7 +236,7 @@ class PPOAgent(Agent):
     ) -> None:
         """Improve the policy, from the weights it has; see ``Agent.learn``."""
         config = self.config
-        adapter = Sb3VecEnv(env, config.reward_scale)
+        adapter = Sb3VecEnv(env, config.reward_scale, config.stack_size)
         model = PPO(
             TaughtPolicy if self.teacher else ActorCriticPolicy,
             adapter,
@@ -201,7 +250,10 @@ class PPOAgent(Agent):
             gae_lambda=config.gae_lambda,
             ent_coef=1.0 if self.teacher else config.ent_coef,
             # Adam in one call for all weights; the epsilon is stable-baselines3's own.
-            policy_kwargs=_policy_options(config) | {"optimizer_kwargs": {"eps": 1e-5, "fused": True}},
+            policy_kwargs={
+                **_policy_options(config, self._observation_space),
+                "optimizer_kwargs": {"eps": 1e-5, "fused": True},
+            },
             device="cpu",
         )
         model.policy.load_state_dict(self.policy.state_dict())
@@ -245,12 +297,18 @@ class PPOAgent(Agent):
         return agent
 
 
-def _policy_options(config: PPOConfig) -> dict[str, Any]:
+def _stacked(space: Box, size: int) -> Box:
+    """Bounds of so many observations."""
+    return space if size == 1 else Box(np.tile(space.low, size), np.tile(space.high, size), dtype=np.float32)
+
+
+def _policy_options(config: PPOConfig, space: Box) -> dict[str, Any]:
+    ignored = [number + place * space.shape[0] for place in range(config.stack_size) for number in config.ignored]
     return {
         "net_arch": list(config.hidden),
         "log_std_init": config.log_std_init,
         "features_extractor_class": Inputs,
-        "features_extractor_kwargs": {"ignored": config.ignored},
+        "features_extractor_kwargs": {"ignored": ignored},
     }
 
 
@@ -302,7 +360,7 @@ class Inputs(BaseFeaturesExtractor):
     seen: torch.Tensor
     is_length: torch.Tensor
 
-    def __init__(self, observation_space: Box, ignored: tuple[int, ...] = ()) -> None:
+    def __init__(self, observation_space: Box, ignored: Sequence[int] = ()) -> None:
         super().__init__(observation_space, features_dim=int(np.prod(observation_space.shape)))
         seen = torch.ones(self.features_dim)
         seen[list(ignored)] = 0.0
@@ -321,7 +379,7 @@ def _state_of(model: PPO, adapter: Sb3VecEnv) -> State:
     Stable-baselines3 draws actions from torch's global stream and batches from NumPy's.
     """
     _, keys, position, has_gauss, gauss = np.random.get_state(legacy=True)  # noqa: NPY002
-    assert isinstance(model._last_obs, np.ndarray)
+    assert isinstance(model._last_obs, np.ndarray)  # all that is stacked
     assert model._last_episode_starts is not None
     arrays = optimizer_arrays(model.policy.optimizer) | {
         "last_observations": model._last_obs.copy(),
@@ -346,6 +404,7 @@ def _go_on(model: PPO, adapter: Sb3VecEnv, state: State) -> None:
     model.num_timesteps, model._n_updates = values["num_timesteps"], values["n_updates"]
     adapter.window, adapter.steps = EpisodeWindow.from_state(values["window"]), values["num_timesteps"]
     model._last_obs, model._last_episode_starts = arrays["last_observations"], arrays["last_episode_starts"]
+    adapter.remember(arrays["last_observations"])
     for name, value in values["log"].items():
         model.logger.record(name, value)
     torch.set_rng_state(torch.from_numpy(arrays["torch_stream"].copy()))
@@ -359,19 +418,25 @@ class Sb3VecEnv(VecEnv):
     building ``num_envs`` dictionaries a step.
     """
 
-    def __init__(self, env: VectorEnv[Any, Any, Any], reward_scale: float = 1.0) -> None:
+    def __init__(self, env: VectorEnv[Any, Any, Any], reward_scale: float = 1.0, stack_size: int = 1) -> None:
         self.env = env
+        self._stack = FrameStack(stack_size)
         self._reward_scale = reward_scale
         self.window = EpisodeWindow()
         self.steps = 0
-        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        assert isinstance(env.single_observation_space, Box)
+        super().__init__(env.num_envs, _stacked(env.single_observation_space, stack_size), env.single_action_space)
+
+    def remember(self, seen: NDArray[Any]) -> None:
+        """Go on with what was seen last, shape ``(n, stack_size * n_numbers)``."""
+        self._stack.frames = seen.reshape(len(seen), self._stack.size, -1).copy()
 
     def reset(self) -> NDArray[Any]:
         """Start all episodes, with the seed that ``seed`` was given."""
         observations, _ = self.env.reset(seed=self._seeds[0])
         check_finite(self.steps, observation=observations)
         self._reset_seeds()
-        return observations
+        return self._stack.begin(observations)
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Keep the actions until ``step_wait``."""
@@ -388,12 +453,13 @@ class Sb3VecEnv(VecEnv):
         dones = terminated | truncated
         infos: list[dict[str, Any]] = [_NOTHING] * self.num_envs
         for i in np.flatnonzero(dones):
+            before = self._stack.frames[i, :-1].ravel()
             infos[i] = {
-                "terminal_observation": info["final_obs"][i],
+                "terminal_observation": np.concatenate([info["final_obs"][i], before]),
                 # A time limit is no end of the task: PPO bootstraps there.
                 "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
             }
-        return observations, scaled, dones, infos
+        return self._stack.push(observations, dones), scaled, dones, infos
 
     def close(self) -> None:
         """Leave the environment open: who made it closes it."""

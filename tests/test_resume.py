@@ -48,6 +48,7 @@ CHANGES = {
     # 1,280 steps in 20 rollouts; four policies are judged, after rollouts 17, 18, 19 and 20.
     "ppo": {
         "num_envs": "8", "steps": "6400", "hidden": "[16]", "n_steps": "8", "batch_size": "32", "n_validations": "20",
+        "stack_size": "2",
         "validation_episodes": "4",
     },
 }  # fmt: skip

@@ -173,7 +173,9 @@ class Sources:
 
             changes = {"seed": str(seed), "log_std_init": "-1.5"}
             config = choose_config("ppo", Choice().preset_of("ppo", problem), changes)
-            shown = demonstrate(problem, table.agent, EARLY, gamma=config.gamma, seed=seed)
+            shown = demonstrate(
+                problem, table.agent, EARLY, gamma=config.gamma, seed=seed, stack_size=config.stack_size
+            )
             worlds = problem.worlds(EARLY, 1)
             agent = PPOAgent(worlds.single_observation_space, worlds.single_action_space, config)
             worlds.close()

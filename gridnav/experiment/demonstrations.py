@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gridnav.agents import Agent, Demonstrations
+from gridnav.agents import Agent, Demonstrations, FrameStack
 from gridnav.experiment.evaluation import follow
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.types import BoolArray, FloatArray
@@ -19,7 +19,7 @@ network that is not quite right will lead them, and the way back is demonstrated
 
 
 def demonstrate(
-    problem: Problem, agent: Agent, world: str, *, gamma: float, seed: int, steps: int = STEPS
+    problem: Problem, agent: Agent, world: str, *, gamma: float, seed: int, steps: int = STEPS, stack_size: int = 1
 ) -> Demonstrations:
     """Let an agent of the grid drive, badly shaken, and note what it would have done.
 
@@ -30,19 +30,23 @@ def demonstrate(
         gamma: Discount per step of the returns.
         seed: Of episodes and noise.
         steps: Of each robot.
+        stack_size: Observations that who learns from it sees at once.
     """
     worlds = problem.for_evaluation.training_worlds(world, ROBOTS, exploring_starts=EXPLORING_STARTS)
     commands = follow(agent.act, worlds)  # type: ignore[arg-type]
     episodes, noise = np.random.SeedSequence([seed, ROBOTS]).spawn(2)
     rng = np.random.default_rng(noise)
     observations, _ = worlds.reset(seed=int(episodes.generate_state(1)[0]))
+    stack = FrameStack(stack_size)
+    stack.begin(observations)
     seen, done, rewards, ends = [], [], [], []
     for _ in range(steps):
-        seen.append(observations)
+        seen.append(stack.seen)
         done.append(commands(observations))
         # Shaking: normal, the same law for forward and turning commands.
         shaken = np.clip(done[-1] + NOISE * rng.standard_normal(done[-1].shape), -1.0, 1.0)
         observations, reward, terminated, truncated, _ = worlds.step(shaken.astype(np.float32))
+        stack.push(observations, terminated | truncated)
         rewards.append(reward)
         ends.append(np.where(terminated, 1, np.where(truncated, 2, 0)))
     worlds.close()

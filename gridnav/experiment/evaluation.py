@@ -38,7 +38,7 @@ def policy_for(agent: Agent, worlds: NavigationVectorEnv) -> Policy:
     on_grid = isinstance(worlds.single_action_space, Discrete)
     if agent.kind == "residual":
         return _corrected(agent, worlds)
-    return drive_by_moves(agent, worlds) if isinstance(agent, TabularAgent) and not on_grid else agent.act
+    return drive_by_moves(agent, worlds) if isinstance(agent, TabularAgent) and not on_grid else agent.begin()
 
 
 def _corrected(agent: Agent, worlds: NavigationVectorEnv) -> Policy:
@@ -46,9 +46,9 @@ def _corrected(agent: Agent, worlds: NavigationVectorEnv) -> Policy:
     from gridnav.agents import RESIDUAL_SHARE, ResidualAgent  # torch takes seconds to import
 
     assert isinstance(agent, ResidualAgent)
-    commands = follow(agent.moves, worlds)
+    commands, corrections = follow(agent.moves, worlds), agent.begin()
     return lambda observations: np.clip(
-        commands(observations) + RESIDUAL_SHARE * agent.act(observations), -1.0, 1.0
+        commands(observations) + RESIDUAL_SHARE * corrections(observations), -1.0, 1.0
     ).astype(np.float32)
 
 

@@ -77,15 +77,13 @@ def _move_values(
 
 def _map_of_commands(agent: Agent, worlds: NavigationVectorEnv, goal: Cell) -> PolicyMap:
     """Mean value of a robot at rest over its headings, and where it drives from the heading that it values most."""
-    layout, policy = worlds.layout, policy_for(agent, worlds)
+    layout = worlds.layout
     cells = np.argwhere(~layout.walls)
     headings = np.arange(N_HEADINGS) * 2 * np.pi / N_HEADINGS
     observations = [_features(worlds, layout.to_metres(cells), heading, goal) for heading in headings]
     values = np.stack([agent.values(one) for one in observations])
-    ways, speeds = zip(
-        *(command_motion(policy(one), heading) for one, heading in zip(observations, headings, strict=True)),
-        strict=True,
-    )
+    commands = [policy_for(agent, worlds)(one) for one in observations]  # each a beginning, of which nobody remembers
+    ways, speeds = zip(*map(command_motion, commands, headings), strict=True)
     best = values.argmax(axis=0), np.arange(len(cells))
 
     def whole(numbers: AnyArray) -> FloatArray:

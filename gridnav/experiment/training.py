@@ -135,10 +135,10 @@ class Carry:
 
 
 def carry_weights(source: Agent, **changes: str) -> Carry:
-    """Begin with the weights of another PPO agent of the same shape."""
+    """Begin with the weights of another PPO agent, see ``PPOAgent.take_weights``."""
 
     def begin(agent: PPOAgent) -> PPOAgent:
-        agent.policy.load_state_dict(source.policy.state_dict())  # type: ignore[attr-defined]
+        agent.take_weights(source)  # type: ignore[arg-type]
         return agent
 
     return Carry(changes, begin)
