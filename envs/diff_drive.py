@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -31,6 +32,7 @@ INTO_WALL = 1e-3
 """Forward command times the cosine of the angle to a wall from which on a command drives into it."""
 LIDAR: dict[str, Any] = {"n_beams": 1, "lidar_range_m": 1.0, "lidar_offset_m": 0.0}
 CAMERAS = ("above", "chase", "onboard")
+log = logging.getLogger(__name__)
 EditModel = Callable[[mujoco.MjSpec], None]
 
 
@@ -92,6 +94,7 @@ class DiffDriveVectorEnv(RobotVectorEnv):
         if self._edit_model is not None:
             self._edit_model(spec)
         self.model = spec.compile()
+        _hush()
         per_look = max(1, int(BUMPER_PERIOD_S / self.model.opt.timestep + 1e-9))
         # How many substeps are made at once between two looks.
         self._looks = [min(per_look, n_substeps - done) for done in range(0, n_substeps, per_look)]
@@ -257,6 +260,15 @@ class DiffDriveEnv(RobotEnv[DiffDriveVectorEnv]):
 
 # `clearances` is called beforehand and constants of other files are passed in: what is compiled and kept on disk does
 # not notice when another file changes.
+def _hush() -> None:
+    """Send MuJoCo's warnings to the log, unless somebody listens already.
+
+    Else it prints them and writes ``MUJOCO_LOG.TXT`` where the user happens to be. Diverged physics is in ``info``.
+    """
+    if mujoco.get_mju_user_warning() is None:
+        mujoco.set_mju_user_warning(log.info)
+
+
 @numba.njit(cache=True)
 def _bump(
     is_first: bool,

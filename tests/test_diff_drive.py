@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -457,6 +458,23 @@ def test_diverged_physics_ends_that_episode_alone_and_says_so(state: str, column
         np.testing.assert_array_equal(observations[others], expected[0][others])
         assert observations in hurt.observation_space
     assert angle_between(hurt._pose[2, 2], begin[2]) > 0.2
+
+
+def test_diverged_physics_prints_nothing_and_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    robots = gym.make_vec(ID, num_envs=4)
+    robots.reset(seed=0)
+    robots._qvel[2, 0] = np.inf
+
+    with caplog.at_level("INFO"):
+        _, _, _, _, info = robots.step(np.zeros((4, 2), np.float32))
+
+    assert info["final_info"]["physics_error"][2]
+    assert any("unstable" in record.message for record in caplog.records)
+    assert list(tmp_path.iterdir()) == []
+    assert capfd.readouterr().err == ""
 
 
 def test_diverged_physics_ends_a_single_environments_episode_too() -> None:

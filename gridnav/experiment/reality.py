@@ -96,7 +96,7 @@ def find_reality(name: str) -> Reality:
 
 
 def _parametric() -> Reality:
-    """The robot of training with numbers beyond the ranges of training, from their ends to what stress tests take."""
+    """Numbers beyond ``burger``, from its ends to what stress tests take; ``wide`` reaches into some."""
     beyond = Randomization(
         wheel_radius=Range(0.96, 0.98),
         wheel_radius_ratio=Range(1.01, 1.02),
@@ -131,7 +131,7 @@ def _parametric() -> Reality:
         position_noise_m=Range(0.03, 0.05),
         goal_noise_m=Range(0.03, 0.05),
     )
-    return Reality("parametric", "numbers beyond the ranges of training, all at once", beyond)
+    return Reality("parametric", "numbers beyond what burger varies, all at once", beyond)
 
 
 def _structural() -> Reality:
