@@ -122,9 +122,10 @@ class DiffDriveVectorEnv(RobotVectorEnv):
         wheels, position = self._wheel_fractions(actions), np.empty((self.num_envs, 2))
         delays_s = self._commands.delays_s(self._steps) if self._is_late else None
         self._physics.begin_period(self._steps, self.control_period_s, delays_s, self._qvel)
+        ids = np.flatnonzero(~self._parked) if self._parked.any() else None
         for n_substeps in [0, *self._looks]:
             if n_substeps:
-                self._batch.step(nstep=n_substeps)
+                self._batch.step(ids, nstep=n_substeps)
             gap, direction, inner = clearances(self._qpos, self.layout)
             _bump(
                 n_substeps == 0,

@@ -123,6 +123,7 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         self._transition = _still(n)
         self._fixed: dict[str, Any] = {}
         self._has_reset = False
+        self._parked = np.zeros(n, dtype=bool)
 
         self.layout = self._own_layout = Layout.load(layout)
         self._use_layout()
@@ -190,6 +191,7 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
             InputError: When an option breaks a rule; nothing has changed then.
         """
         fixed, layout = self._checked_options(options)
+        self._parked = np.zeros(self.num_envs, dtype=bool)
         if seed is not None:
             self.use_generators(self._generators(seed))
         layout = self._vary(layout, fixed)
@@ -312,6 +314,13 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
     def goal_cells(self) -> IntArray:
         """Goals an episode may have, (row, column), shape ``(n_goals, 2)``, in the order of ``cell_goal``."""
         return self.task.goal_cells(self.layout)
+
+    def park(self, parked: BoolArray) -> None:
+        """Say whom nobody looks at until the next reset, shape ``(n,)``: a world may spare itself what they do.
+
+        What becomes of the others is the same to the last bit.
+        """
+        self._parked = parked.copy()
 
     def cell_goal(self, cells: IntArray, goals: IntArray) -> IntArray:
         """What robots on the grid would observe there.

@@ -460,6 +460,35 @@ def test_diverged_physics_ends_that_episode_alone_and_says_so(state: str, column
     assert angle_between(hurt._pose[2, 2], begin[2]) > 0.2
 
 
+@pytest.mark.parametrize("randomization", ["none", "wide"])
+def test_parked_robots_stand_and_the_others_notice_nothing(randomization: str) -> None:
+    some, all_of_them = (gym.make_vec(ID, num_envs=4, randomization=randomization) for _ in range(2))
+    some.reset(seed=0)
+    all_of_them.reset(seed=0)
+    rng = np.random.default_rng(0)
+    script = rng.uniform(-1, 1, (30, 4, 2)).astype(np.float32)
+    parked = np.array([False, True, False, True])
+    for commands in script[:10]:
+        some.step(commands)
+        all_of_them.step(commands)
+
+    some.park(parked)
+    begin = some._pose.copy()
+    for commands in script[10:]:
+        observations, rewards, *_ = some.step(commands)
+        expected = all_of_them.step(commands)
+        np.testing.assert_array_equal(observations[~parked], expected[0][~parked])
+        np.testing.assert_array_equal(rewards[~parked], expected[1][~parked])
+    np.testing.assert_array_equal(some._pose[parked], begin[parked])
+    assert not np.array_equal(all_of_them._pose[parked], begin[parked])
+
+    # A reset lets everybody go.
+    again, expected_again = some.reset(seed=1)[0], all_of_them.reset(seed=1)[0]
+    np.testing.assert_array_equal(again, expected_again)
+    for commands in script:
+        np.testing.assert_array_equal(some.step(commands)[0], all_of_them.step(commands)[0])
+
+
 def test_diverged_physics_prints_nothing_and_leaves_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:

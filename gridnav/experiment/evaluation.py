@@ -146,13 +146,16 @@ def evaluate(
         reached = info.get("final_info", info)
         if on_info:
             on_info(reached)
-        for i in np.flatnonzero((terminated | truncated) & running):
+        ended = np.flatnonzero((terminated | truncated) & running)
+        for i in ended:
             last[i] = _of_one(reached, int(i))
-            running[i] = False
+        if ended.size:
+            running[ended] = False
+            worlds.park(~running)
         if on_progress and "final_info" in info:
-            ended = n - int(running.sum())
+            n_ended = n - int(running.sum())
             arrived = sum(bool(one["is_success"]) for one in last if one)
-            on_progress(Progress(ended, n, {"success_rate": arrived / max(ended, 1)}))
+            on_progress(Progress(n_ended, n, {"success_rate": arrived / max(n_ended, 1)}))
     return course.episodes(last)
 
 

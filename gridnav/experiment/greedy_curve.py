@@ -64,6 +64,7 @@ class GreedyCurve:
                 arrived[ended] = info["final_info"]["is_success"][ended]
                 collided[ended] = info["final_info"]["collisions"][ended] > 0
                 running &= ~ended
+                worlds.park(~running)
         self.seconds += time.perf_counter() - began
         return {SUCCESS: float(arrived.mean()), "greedy_collision_rate": float(collided.mean())}
 
