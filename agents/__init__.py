@@ -3,7 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from .base import Agent, EpisodeWindow, FrameStack, OnCut, OnProgress, Progress, read_state, write_state
+from .base import Agent, EpisodeWindow, FrameStack, OnCut, OnProgress, Policy, Progress, read_state, write_state
 from .hyper_parameters import EpsilonGreedyConfig
 from .planner import Planner
 from .q_learning import Q_LEARNING_PRESETS, QLearning, QLearningConfig
@@ -32,6 +32,7 @@ __all__ = [
     "PPOAgent",
     "PPOConfig",
     "Planner",
+    "Policy",
     "Progress",
     "QLearning",
     "QLearningConfig",

@@ -40,7 +40,7 @@ OnCut = Callable[[Callable[[], State]], None]
 """Called wherever training may be cut in two, with what makes the state of training there. It may raise to end it."""
 
 
-Act = Callable[[NDArray[Any]], NDArray[Any]]
+Policy = Callable[[NDArray[Any]], NDArray[Any]]
 """Observations of a batch to its actions."""
 
 
@@ -86,7 +86,7 @@ class Agent(ABC):
     def act(self, observations: NDArray[Any]) -> NDArray[Any]:
         """Greedy actions for a batch of observations, shape ``(n, ...)`` both."""
 
-    def begin(self) -> Act:
+    def begin(self) -> Policy:
         """What acts in the episodes of a batch from their beginning on, asked once a step; it may remember."""
         return self.act
 

@@ -28,7 +28,7 @@ from torch.distributions import Normal, kl_divergence
 
 from gridnav.problem.types import InputError, State
 
-from .base import Act, Agent, EpisodeWindow, FrameStack, OnCut, OnProgress, Progress, check_finite, reached
+from .base import Agent, EpisodeWindow, FrameStack, OnCut, OnProgress, Policy, Progress, check_finite, reached
 from .hyper_parameters import check_numbers
 from .torch_state import guard_gradients, load_optimizer_arrays, optimizer_arrays
 
@@ -157,7 +157,7 @@ class PPOAgent(Agent):
         self.config = config
         self.teacher: PPOAgent | None = None
         """Whose policy it is drawn to while it learns, if anybody's; no part of its state."""
-        self._observation_space, self._action_space = observation_space, action_space
+        self.observation_space, self.action_space = observation_space, action_space
         # Two threads on these small networks are slower than one, and the thread count is part of the seed.
         torch.set_num_threads(1)
         torch.manual_seed(config.seed)
@@ -178,7 +178,7 @@ class PPOAgent(Agent):
         """
         return self.policy.predict(self._stack(observations), deterministic=True)[0]
 
-    def begin(self) -> Act:
+    def begin(self) -> Policy:
         """The same with a memory of the observations before."""
         if self.config.stack_size == 1:
             return self.act
@@ -197,7 +197,7 @@ class PPOAgent(Agent):
 
     def _stack(self, observations: NDArray[Any]) -> NDArray[Any]:
         size = self.config.stack_size
-        is_one = size > 1 and observations.shape[1] == self._observation_space.shape[0]
+        is_one = size > 1 and observations.shape[1] == self.observation_space.shape[0]
         return FrameStack(size).begin(observations) if is_one else observations
 
     def take_weights(self, source: PPOAgent) -> None:
@@ -251,7 +251,7 @@ class PPOAgent(Agent):
             ent_coef=1.0 if self.teacher else config.ent_coef,
             # Adam in one call for all weights; the epsilon is stable-baselines3's own.
             policy_kwargs={
-                **_policy_options(config, self._observation_space),
+                **_policy_options(config, self.observation_space),
                 "optimizer_kwargs": {"eps": 1e-5, "fused": True},
             },
             device="cpu",
@@ -272,7 +272,7 @@ class PPOAgent(Agent):
     def state(self) -> State:
         """Weights; spaces and hyper-parameters."""
         arrays = {name: tensor.numpy().copy() for name, tensor in self.policy.state_dict().items()}
-        spaces = {"observation_space": self._observation_space, "action_space": self._action_space}
+        spaces = {"observation_space": self.observation_space, "action_space": self.action_space}
         bounds = {name: {"low": space.low.tolist(), "high": space.high.tolist()} for name, space in spaces.items()}
         return State(arrays, {"config": asdict(self.config), **bounds})
 

@@ -32,7 +32,7 @@ INTO_WALL = 1e-3
 """Forward command times the cosine of the angle to a wall from which on a command drives into it."""
 LIDAR: dict[str, Any] = {"n_beams": 1, "lidar_range_m": 1.0, "lidar_offset_m": 0.0}
 CAMERAS = ("above", "chase", "onboard")
-log = logging.getLogger(__name__)
+log = logging.getLogger("gridnav")
 EditModel = Callable[[mujoco.MjSpec], None]
 
 
@@ -259,8 +259,6 @@ class DiffDriveEnv(RobotEnv[DiffDriveVectorEnv]):
         return self.worlds.model
 
 
-# `clearances` is called beforehand and constants of other files are passed in: what is compiled and kept on disk does
-# not notice when another file changes.
 def _hush() -> None:
     """Send MuJoCo's warnings to the log, unless somebody listens already.
 
@@ -270,6 +268,8 @@ def _hush() -> None:
         mujoco.set_mju_user_warning(log.info)
 
 
+# `clearances` is called beforehand and constants of other files are passed in: what is compiled and kept on disk does
+# not notice when another file changes.
 @numba.njit(cache=True)
 def _bump(
     is_first: bool,

@@ -275,6 +275,7 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
             name.removeprefix("streams."): array for name, array in arrays.items() if name.startswith("streams.")
         }
         self._streams.set_state(State(streams, values))
+        self._parked = np.zeros(self.num_envs, dtype=bool)
         self._has_reset = values["has_reset"]
 
     def _check_state(self, arrays: dict[str, AnyArray], layout: Layout) -> None:
@@ -327,14 +328,18 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
 
         Args:
             cells: Where they are, (row, column), shape ``(n, 2)``.
-            goals: Where they are to go, shape ``(n, 2)``; what is no goal of the task counts as its first one.
+            goals: Where they are to go, shape ``(n, 2)``, see ``rank_of``.
 
         Returns:
             ``cell * n_goals + goal``, shape ``(n,)``.
         """
-        ranks = np.maximum(self.goal_ranks[tuple(goals.T)], 0)
-        numbers: IntArray = (cells[:, 0] * self.layout.n_cols + cells[:, 1]) * len(self.goal_cells) + ranks
-        return numbers
+        numbers = cells[:, 0] * self.layout.n_cols + cells[:, 1]
+        return numbers * len(self.goal_cells) + self.rank_of(goals)
+
+    def rank_of(self, goals: IntArray) -> IntArray:
+        """Place of each goal cell, shape ``(n, 2)``, among ``goal_cells``; 0 for what is no goal of the task."""
+        ranks: IntArray = np.maximum(self.goal_ranks[tuple(goals.T)], 0)
+        return ranks
 
     # ---- Episodes ----------------------------------------------------------------------------
 

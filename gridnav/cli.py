@@ -302,7 +302,14 @@ class Sweep:
 
             with _progress() as on_stage:
                 sentence = write_study(
-                    self.study, trials, outcomes, run, on_stage, jobs=jobs, command=_again(run), config=config
+                    self.study,
+                    trials,
+                    outcomes,
+                    run,
+                    on_stage,
+                    jobs=min(jobs, cpu_count()),
+                    command=_again(run),
+                    config=config,
                 )
             stdout.print(f"report     {run.report}\n{sentence}", markup=False)
         return 0

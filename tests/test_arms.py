@@ -292,16 +292,18 @@ class Crash(BaseException):
 CHANGES = {"num_envs": "8", "steps": "640", "hidden": "[16]", "n_steps": "8", "batch_size": "32", "n_validations": "0"}
 
 
-def sources_of(name: str) -> list[Trained]:
+def sources_of(name: str, stack_size: int) -> list[Trained]:
     """What an arm builds on, made quickly: a plan, and networks that know nothing."""
     worlds = CORNER.worlds("Unicycle", 1)
     spaces = worlds.single_observation_space, worlds.single_action_space
-    network = PPOAgent(*spaces, PPOConfig(hidden=(16,), seed=9))
+    network = PPOAgent(*spaces, PPOConfig(hidden=(16,), seed=9, stack_size=stack_size))
     agents: dict[str, Agent] = {"q-learning": planner(CORNER), "ppo-unicycle": network, "cloned": network}
     return [Trained(source, agents[source], 1, 1.0) for source in ARMS[name].sources]
 
 
-def train_arm(run: RunDirectory, name: str, *, crash_at: int = 0, with_curve: bool = True) -> Trained:
+def train_arm(
+    run: RunDirectory, name: str, *, crash_at: int = 0, with_curve: bool = True, stack_size: int = 1
+) -> Trained:
     reports = itertools.count(1)
 
     def on_stage(words: str) -> Callable[[Progress], None]:
@@ -313,16 +315,25 @@ def train_arm(run: RunDirectory, name: str, *, crash_at: int = 0, with_curve: bo
 
     prepare = ARMS[name].prepare
     assert prepare is not None
-    carry = prepare(CORNER, sources_of(name))
+    carry = prepare(CORNER, sources_of(name, stack_size))
     with open_log(run) as log:
         workshop = Workshop(Job(CORNER, Budget(1.0, 2), 0, run, on_stage, checkpoint_s=0.0), log)
-        choice = Choice(changes=CHANGES)
+        choice = Choice(changes={**CHANGES, "stack_size": str(stack_size)})
         return workshop.train(name, "ppo", "Unicycle", carry=carry, choice=choice, with_curve=with_curve)
 
 
 def new_run(path: Path) -> RunDirectory:
     with RunDirectory.create(path, "ladder", {}) as run:
         return run
+
+
+@pytest.mark.parametrize("name", ["scratch", "potential", "clone", "kickstart", "weights", "residual"])
+def test_every_arm_can_learn_with_a_memory(name: str, tmp_path: Path) -> None:
+    trained = train_arm(new_run(tmp_path / "run"), name, stack_size=3)
+
+    assert trained.agent.config.stack_size == 3  # type: ignore[attr-defined]
+    worlds = CORNER.worlds("Unicycle", 2)
+    assert len(evaluate(policy_for(trained.agent, worlds), worlds)) == 2
 
 
 @pytest.mark.parametrize("name", ["potential", "clone", "kickstart", "residual"])

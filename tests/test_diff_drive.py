@@ -503,7 +503,7 @@ def test_diverged_physics_prints_nothing_and_leaves_no_file(
     assert info["final_info"]["physics_error"][2]
     assert any("unstable" in record.message for record in caplog.records)
     assert list(tmp_path.iterdir()) == []
-    assert capfd.readouterr().err == ""
+    assert capfd.readouterr() == ("", "")
 
 
 def test_diverged_physics_ends_a_single_environments_episode_too() -> None:

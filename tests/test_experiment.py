@@ -157,3 +157,17 @@ def test_metrics_that_do_not_fit_the_checkpoint_are_refused_and_left_as_they_are
             MetricsLog(run, 36 if len(content) == 36 else 60)
 
     assert (run.path / "metrics.jsonl").read_bytes() == content + b"more than that"
+
+
+def test_robots_whose_episode_is_over_are_parked_and_no_number_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    worlds = PROBLEM.worlds("DiffDrive", 4)
+    plan = Planner.solve(PROBLEM.layout, PROBLEM.task, PROBLEM.reward)
+    parked: list[list[bool]] = []
+    park = worlds.park
+    monkeypatch.setattr(worlds, "park", lambda who: (parked.append(who.tolist()), park(who)))
+
+    sparing = [episode.row() for episode in evaluate(policy_for(plan, worlds), worlds)]
+
+    assert [sum(who) for who in parked] == [1, 2, 3, 4, 0]  # one after the other, and all may go in the end
+    monkeypatch.setattr(worlds, "park", lambda who: None)
+    assert sparing == [episode.row() for episode in evaluate(policy_for(plan, worlds), worlds)]

@@ -3,27 +3,29 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import run_cli
 
-from gridnav.agents import Planner
+from gridnav.agents import Planner, Progress
+from gridnav.experiment import sim_to_real
 from gridnav.experiment.checkpoint import save_agent
 from gridnav.experiment.rollouts import load_rollouts, names
 from gridnav.experiment.run_directory import RunDirectory, write_json
-from gridnav.experiment.sim_to_real import SEALED_LOG, correlation
+from gridnav.experiment.sim_to_real import SEALED_LOG, correlation, measure, measure_once
 from gridnav.experiment.worlds import Problem
 
 CORRIDOR = "S..G\n"
 
 
-def plan_run(path: Path) -> Path:
+def plan_run(path: Path, corridor: str = CORRIDOR) -> Path:
     """A run whose one agent is a plan that drives the robot."""
-    problem = Problem.load(CORRIDOR, "default", "default")
+    problem = Problem.load(corridor, "default", "default")
     plan = Planner.solve(problem.layout, problem.task, problem.reward)
-    config = {"command": "train", "layout": CORRIDOR, "task": "default", "reward": "default", "seed": 0}
+    config = {"command": "train", "layout": corridor, "task": "default", "reward": "default", "seed": 0}
     row = {"world": "DiffDrive", "agent": "plan", "carried": "", "checkpoint": "plan", "observation": "cell_goal"}
     with RunDirectory.create(path, "plan", config) as run:
         save_agent(plan, run.checkpoints, 0, name="plan")
@@ -74,6 +76,7 @@ def test_evaluate_reality_measures_reports_keeps_and_counts(tmp_path: Path) -> N
         (("--keep", "kept"), "--report and --keep go with --reality"),
         (("--reality", "structural", "--seed", "3"), "do not go with --reality"),
         (("--reality", "moon"), "moon"),
+        (("--reality", "test", "--keep", "kept"), "no episode of the test reality is shown"),
     ],
 )
 def test_what_does_not_go_together_is_one_line(
@@ -85,3 +88,33 @@ def test_what_does_not_go_together_is_one_line(
     error = capsys.readouterr().err
     assert words in error
     assert error.count("\n") == 1
+
+
+def test_episodes_of_two_mazes_cannot_be_kept_together_and_nothing_is_measured_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs = plan_run(tmp_path / "one"), plan_run(tmp_path / "other", "G..S\n")
+    monkeypatch.setattr(sim_to_real, "measure", lambda *_, **__: pytest.fail("it was measured"))
+
+    assert run_cli("evaluate", *map(str, runs), "--reality", "structural", "--keep", str(tmp_path / "kept")) == 2
+    assert "--keep takes runs of one maze" in capsys.readouterr().err
+    assert not (tmp_path / "kept").exists()
+
+
+def test_runs_measured_in_workers_have_the_numbers_they_have_alone_and_are_measured_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs = {name: RunDirectory.open(plan_run(tmp_path / name)) for name in ("one", "other")}
+    told = []
+
+    def on_stage(name: str) -> Callable[[Progress], None]:
+        return lambda progress: told.append(progress.steps)
+
+    found = measure_once(runs, ["parametric"], 2, on_stage, jobs=2)
+
+    (alone,) = measure([runs["one"]], ["parametric"], 2, lambda name: lambda progress: None)
+    for name, gap in found.items():
+        assert (gap.policy, gap.at_home, gap.away) == (name, alone.at_home, alone.away)
+    assert told == [1, 2]
+    monkeypatch.setattr(sim_to_real, "in_workers", lambda *_: pytest.fail("it was measured again") if _[1] else ())
+    assert measure_once(runs, ["parametric"], 2, on_stage, jobs=2).keys() == runs.keys()

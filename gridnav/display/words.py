@@ -1,4 +1,4 @@
-"""Numbers in words, for pages and sentences: the same everywhere."""
+"""Numbers in words, for pages and sentences."""
 
 from __future__ import annotations
 

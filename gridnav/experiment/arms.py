@@ -95,8 +95,7 @@ def residual(problem: Problem, sources: Sequence[Trained]) -> Carry:
     action_values = table.agent.action_values
 
     def begin(agent: PPOAgent) -> PPOAgent:
-        spaces = agent.policy.observation_space, agent.policy.action_space
-        return ResidualAgent(*spaces, agent.config, action_values)
+        return ResidualAgent(agent.observation_space, agent.action_space, agent.config, action_values)
 
     def wrap(worlds: NavigationVectorEnv, agent: PPOAgent) -> Corrected:
         assert isinstance(agent, ResidualAgent)
@@ -164,15 +163,15 @@ class Sources:
         return self._workshop.train(NETWORK, "ppo", EARLY)
 
     def _clone(self) -> Trained:
+        from gridnav.agents import PPOAgent  # torch takes seconds to import
+        from gridnav.agents import clone as learn_by_heart
+
         problem, seed = self._workshop.problem, self._workshop.seed
         (table,) = self.get([TABLE])
+        changes = {"seed": str(seed), "log_std_init": "-1.5"}
+        config = choose_config("ppo", Choice().preset_of("ppo", problem), changes)
 
         def make() -> tuple[Agent, int, dict[str, float]]:
-            from gridnav.agents import PPOAgent  # torch takes seconds to import
-            from gridnav.agents import clone as learn_by_heart
-
-            changes = {"seed": str(seed), "log_std_init": "-1.5"}
-            config = choose_config("ppo", Choice().preset_of("ppo", problem), changes)
             shown = demonstrate(
                 problem, table.agent, EARLY, gamma=config.gamma, seed=seed, stack_size=config.stack_size
             )
@@ -181,7 +180,7 @@ class Sources:
             worlds.close()
             return agent, len(shown.actions), learn_by_heart(agent, shown)
 
-        return self._workshop.keep(CLONE, EARLY, make)
+        return self._workshop.keep(CLONE, EARLY, config, make)
 
 
 # ---- The table's values as a function of places --------------------------------------------------
@@ -219,6 +218,6 @@ def potential_of(worlds: NavigationVectorEnv, values: FloatArray) -> Callable[[A
     def of(observations: Any) -> FloatArray:
         poses, goals_w = worlds.features.poses_and_goals(observations)
         goals = worlds.layout.to_cell(goals_w)
-        return place_value(poses, worlds.goal_ranks[tuple(goals.T)])
+        return place_value(poses, worlds.rank_of(goals))
 
     return of

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 
-from gridnav.agents import Agent, OnProgress, Progress, TabularAgent
+from gridnav.agents import Agent, OnProgress, Policy, Progress, TabularAgent
 from gridnav.envs import MoveDriver, NavigationVectorEnv, glide, lead
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.behaviour import diagnose
@@ -24,9 +24,6 @@ EVALUATION_SEED = 1_000_000
 
 HELD_OUT_LAYOUTS = 100
 """Layouts of an evaluation in a family of layouts, if there are episodes enough."""
-
-Policy = Callable[[NDArray[Any]], NDArray[Any]]
-"""Observations of all environments to their actions, a leading batch axis on both."""
 
 
 class PolicyStopped(Exception):  # noqa: N818, no error
@@ -156,6 +153,7 @@ def evaluate(
             n_ended = n - int(running.sum())
             arrived = sum(bool(one["is_success"]) for one in last if one)
             on_progress(Progress(n_ended, n, {"success_rate": arrived / max(n_ended, 1)}))
+    worlds.park(np.zeros(n, dtype=bool))
     return course.episodes(last)
 
 

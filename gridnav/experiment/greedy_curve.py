@@ -65,6 +65,7 @@ class GreedyCurve:
                 collided[ended] = info["final_info"]["collisions"][ended] > 0
                 running &= ~ended
                 worlds.park(~running)
+        worlds.park(np.zeros_like(running))
         self.seconds += time.perf_counter() - began
         return {SUCCESS: float(arrived.mean()), "greedy_collision_rate": float(collided.mean())}
 

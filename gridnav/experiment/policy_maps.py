@@ -50,7 +50,7 @@ def _map_of_moves(
 ) -> PolicyMap:
     """The best move and what it is worth, without the shaping, so that values grow towards the goal."""
     layout = problem.layout
-    rank = problem.task.goal_cells(layout).tolist().index(list(goal))
+    rank = int(problem.task.goal_ranks(layout)[goal])
     moves = _move_values(agent, worlds, layout, rank, goal, observation)
     distance = cell_distances(layout, goal).ravel()
     best, directions = best_moves(moves)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gridnav.agents import Planner
+from gridnav.agents import Planner, Policy
 from gridnav.envs import NavigationVectorEnv
-from gridnav.experiment.evaluation import EVALUATION_SEED, Policy, drive_by_moves
+from gridnav.experiment.evaluation import EVALUATION_SEED, drive_by_moves
 from gridnav.experiment.worlds import make_worlds
 from gridnav.problem.layout import Layout
 from gridnav.problem.lint import Finding

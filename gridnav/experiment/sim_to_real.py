@@ -142,7 +142,7 @@ def measure_once(
         jobs: How many policies at once.
     """
     asked = {"realities": list(realities), "episodes": episodes}
-    left = [run.path for run in runs.values() if not _is_measured(run, asked)]
+    left = [run.path.resolve() for run in runs.values() if not _is_measured(run, asked)]
     report = on_stage("policies in realities") if left else None
     for number, _ in enumerate(in_workers(_measure_run, [(path, asked) for path in left], jobs), start=1):
         if report:
@@ -219,7 +219,9 @@ def check_one_maze(runs: Sequence[RunDirectory]) -> None:
     Raises:
         InputError: When they are of several mazes.
     """
-    if len({stored_evaluation(run)[0].layout for run in runs}) > 1:
+    stored = [stored_evaluation(run) for run in runs]
+    mazes = {problem.layout for problem, rows in stored if any(row["world"] != "GridWorld" for row in rows.values())}
+    if len(mazes) > 1:
         raise InputError("--keep takes runs of one maze: their episodes are shown in it")
 
 

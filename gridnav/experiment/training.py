@@ -276,11 +276,7 @@ class Workshop:
         agent, worlds, steps = make_learner(self.problem, kind, world, self.seed, self.budget, choice, carry)
         before = Standing(run_steps=self._run_steps)
         if saved is not None:
-            if getattr(saved.agent, "config", None) != getattr(agent, "config", None):
-                raise InputError(
-                    f"the checkpoint of {name!r} was trained with other hyper-parameters than these: they are another "
-                    "gridnav's; begin another run"
-                )
+            _check_config(name, saved.agent, getattr(agent, "config", None))
             agent, before = saved.agent, saved.standing
             bring_back(worlds, saved, name)
         if carry.teacher is not None:
@@ -301,12 +297,15 @@ class Workshop:
         self._run_steps = end.run_steps
         return Trained(name, course.agent, end.steps, end.seconds, world, choice.observation, course.visits)
 
-    def keep(self, name: str, world: str, make: Callable[[], tuple[Agent, int, dict[str, float]]]) -> Trained:
+    def keep(
+        self, name: str, world: str, config: object, make: Callable[[], tuple[Agent, int, dict[str, float]]]
+    ) -> Trained:
         """An agent that comes about in one go, with a checkpoint in the run, or the one an earlier process made.
 
         Args:
             name: Name of its metrics and of its checkpoint.
             world: Where it has its experience from.
+            config: Its hyper-parameters.
             make: Gives the agent, the environment steps that it took, and metrics.
         """
         saved = load_checkpoint(self._run.checkpoints, name)
@@ -318,6 +317,7 @@ class Workshop:
             seconds, run_steps = time.perf_counter() - began, self._run_steps + steps
             saved = Checkpoint(agent, Standing(steps, seconds, run_steps, self._log.sync(), True), None, None)
             save_checkpoint(self._run.checkpoints, name, saved)
+        _check_config(name, saved.agent, config)
         self._run_steps = saved.standing.run_steps
         return Trained(name, saved.agent, saved.standing.steps, saved.standing.seconds, world)
 
@@ -344,6 +344,19 @@ class Workshop:
             name, world, agent, carried, trained.name, episodes, steps, seconds, trained.observation, maps,
             self.problem.randomization.to_json(),
         )  # fmt: skip
+
+
+def _check_config(name: str, saved: Agent, config: object) -> None:
+    """Whether a checkpoint's agent has these hyper-parameters.
+
+    Raises:
+        InputError: When it has others.
+    """
+    if getattr(saved, "config", None) != config:
+        raise InputError(
+            f"the checkpoint of {name!r} was trained with other hyper-parameters than these: they are another "
+            "gridnav's; begin another run"
+        )
 
 
 def make_learner(

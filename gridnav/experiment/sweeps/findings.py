@@ -128,7 +128,7 @@ def _foretelling(done: Sequence[Done], gaps: Sequence[Gap]) -> Table:
     legend = (
         f"Correlation over {len(gaps)} policies of success in a simulation with success in a reality (SRCC), with 95 % "
         "bootstrap intervals over policies. At home every policy has a world of its own; the others are one for all. "
-        "Trainings that ended early are among them, so that the policies differ in quality."
+        "Short trainings are among them, so that the policies differ in quality."
     )
     return Table("Which simulation foretells realities", ("simulation", *DEVELOPMENT), rows, legend)
 

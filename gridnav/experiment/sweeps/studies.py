@@ -22,8 +22,8 @@ UNDER = {"none": "none", "burger": "burger", "wide": "wide"}
 """Where agents of the presets are evaluated."""
 WHOLE = "whole"
 """A training of its preset's length."""
-SHORT = {"none": (48_000, 144_000), "wide": (144_000, 432_000)}
-"""Steps of trainings that end early, so that there are policies of every quality whose success is to be foretold."""
+SHORT = {"none": {"1/10": 48_000, "3/10": 144_000}, "wide": {"1/10": 144_000, "3/10": 432_000}}
+"""Steps of short trainings, by their share of the whole: so there are policies of every quality to foretell."""
 STRENGTHS = tuple(k / 4 for k in range(9))
 REACHES = (0.5, 1.0, 1.5, 2.0)
 """How far a quantity goes from its nominal value, as a share of the way to either end of its range."""
@@ -82,9 +82,9 @@ def _plan_arms(wish: Wish) -> list[Draft]:
 def _plan_presets(wish: Wish) -> list[Draft]:
     whole = [_preset(preset, WHOLE, seed, ()) for preset in RANDOMIZATION_PRESETS for seed in wish.seeds]
     short = [
-        _preset(preset, f"{steps} steps", seed, (f"steps={steps}",))
+        _preset(preset, share, seed, (f"steps={steps}",))
         for preset, lengths in SHORT.items()
-        for steps in lengths
+        for share, steps in lengths.items()
         for seed in wish.seeds
     ]
     return whole + short
