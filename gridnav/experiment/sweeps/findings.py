@@ -116,21 +116,26 @@ def _foretelling(done: Sequence[Done], gaps: Sequence[Gap]) -> Table:
         simulated[f"under {under}"] = [
             float(row["success"]) for one in done for row in one.outcome.rows if row["under"] == under
         ]
+    everyone = np.arange(len(gaps))
+    whole = np.flatnonzero([one.trial.settings["training"] == WHOLE for one in done])
+    groups = {f"{len(whole)} whole trainings": whole, f"all {len(gaps)}": everyone}
     rows = []
     for name, successes in simulated.items():
         words = []
         for place in DEVELOPMENT:
-            away = [gap.away[place].success_rate for gap in gaps]
-            found = correlation(np.column_stack([successes, away]))
-            low, high = found.pearson_interval
-            words.append(f"{found.pearson:.2f} ({low:.2f} to {high:.2f}), of ranks {found.spearman:.2f}")
+            pairs = np.column_stack([successes, [gap.away[place].success_rate for gap in gaps]])
+            for group in groups.values():
+                found = correlation(pairs[group])
+                low, high = found.pearson_interval
+                words.append(f"{found.pearson:.2f} ({low:.2f} to {high:.2f}), of ranks {found.spearman:.2f}")
         rows.append([name, *words])
     legend = (
-        f"Correlation over {len(gaps)} policies of success in a simulation with success in a reality (SRCC), with 95 % "
-        "bootstrap intervals over policies. At home every policy has a world of its own; the others are one for all. "
-        "Short trainings are among them, so that the policies differ in quality."
+        "Correlation over policies of success in a simulation with success in a reality (SRCC), with 95 % bootstrap "
+        "intervals over policies. At home every policy has a world of its own; the others are one for all. Short "
+        "trainings make policies that differ in quality."
     )
-    return Table("Which simulation foretells realities", ("simulation", *DEVELOPMENT), rows, legend)
+    columns = ("simulation", *(f"{place}, {group}" for place in DEVELOPMENT for group in groups))
+    return Table("Which simulation foretells realities", columns, rows, legend)
 
 
 def _kept_table(gaps: Mapping[str, Sequence[Gap]]) -> Table:
@@ -317,8 +322,7 @@ def _matrix(
     title: str, first: str, cells: Mapping[tuple[str, str], _Cell], names: Iterable[str], tests: Sequence[str]
 ) -> Table:
     """One row per training, one column of success per test; SPL and collisions in the first test."""
-    successes = [f"success under {test}" for test in tests]
-    columns = (first, *successes, f"SPL under {tests[0]}", "episodes with a collision", "seeds")
+    columns = (first, *(f"success under {test}" for test in tests), f"SPL under {tests[0]}", "collided", "seeds")
     rows = []
     for name in names:
         here = cells[name, tests[0]]
