@@ -116,9 +116,8 @@ def _foretelling(done: Sequence[Done], gaps: Sequence[Gap]) -> Table:
         simulated[f"under {under}"] = [
             float(row["success"]) for one in done for row in one.outcome.rows if row["under"] == under
         ]
-    everyone = np.arange(len(gaps))
     whole = np.flatnonzero([one.trial.settings["training"] == WHOLE for one in done])
-    groups = {f"{len(whole)} whole trainings": whole, f"all {len(gaps)}": everyone}
+    groups = {f"{len(whole)} whole trainings": whole, f"all {len(gaps)}": np.arange(len(gaps))}
     rows = []
     for name, successes in simulated.items():
         words = []
