@@ -162,6 +162,12 @@ class DiffDriveVectorEnv(RobotVectorEnv):
             # Back to the last good pose, so that what is observed stays finite.
             self._rest(np.flatnonzero(self._failed))
 
+    @property
+    def lean_rad(self) -> FloatArray:
+        """Angle between each robot's own up and the world's, radians, shape ``(n,)``."""
+        _, _, _, _, x, y, _ = self._qpos[:, :7].T
+        return np.arccos(np.clip(1.0 - 2.0 * (x**2 + y**2), -1.0, 1.0))
+
     def get_state(self) -> State:
         """Everything that decides what comes next, the engine's own state included."""
         arrays, values = super().get_state()

@@ -10,6 +10,9 @@ python scripts/measure.py ppo-warm [SEED ...]       PPO on DiffDrive, warm-start
 python scripts/measure.py ppo-settings [SEED ...]   PPO's environments, rollout, batch, epochs and network compared
 python scripts/measure.py sac [SEED ...]            SAC of stable-baselines3 on DiffDrive, success against time
 python scripts/measure.py randomization             what randomising 256 DiffDrives costs, by preset and by quantity
+python scripts/measure.py drivable [RANDOMIZATION ...]
+                                                    robots that fall or slip whatever they are told, of randomizations
+                                                    or of all presets and the realities that are open
 """
 
 import sys
@@ -24,8 +27,10 @@ import numpy as np
 
 from gridnav.agents import Planner, QLearning
 from gridnav.envs import RANDOMIZATION_PRESETS, Randomization
+from gridnav.experiment.drivability import try_driving
 from gridnav.experiment.evaluation import evaluate, policy_for
 from gridnav.experiment.ladder import steps_to
+from gridnav.experiment.reality import find_reality
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
 from gridnav.experiment.training import BUDGETS, Choice, Job, Workshop, carry_weights, make_learner
 from gridnav.experiment.worlds import Problem
@@ -205,6 +210,21 @@ def randomization(num_envs: int = 256, rounds: int = 9, steps: int = 20) -> None
         print(f"{name}: {np.median(ratios):.2f} ({ratios.min():.2f} to {ratios.max():.2f})", flush=True)
 
 
+def drivable(sources: Sequence[str], n: int = 1000) -> None:
+    """Robots that fall over or slip where they stand, driving squares on an open floor."""
+    presets = [name for name in RANDOMIZATION_PRESETS if name != "curriculum"]  # which ends where `wide` does
+    cases = {name: (Randomization.load(name), {}) for name in sources or presets}
+    if not sources:
+        realities = {name: find_reality(name) for name in ("parametric", "structural")}
+        cases |= {
+            name: (one.randomization, {"edit_model": one.edit_model, "timestep_s": one.timestep_s})
+            for name, one in realities.items()
+        }
+    for name, (randomization, options) in cases.items():
+        found = try_driving(randomization, n, **options)
+        print(f"{name}: {found.falls.mean():.1%} fall, {found.slips.mean():.1%} slip where they stand", flush=True)
+
+
 def ppo_settings(seeds: Sequence[int]) -> None:
     """Each setting with each seed: speed, steps to a training success of 95 %, and what the greedy policy achieves."""
     from gridnav.agents import PPOAgent, PPOConfig
@@ -256,7 +276,7 @@ def _workshop(seed: int, problem: Problem = PROBLEM) -> Iterator[tuple[Workshop,
 
 if __name__ == "__main__":
     what, *numbers = sys.argv[1:] or ["help"]
-    seeds = [int(number) for number in numbers]
+    seeds = [int(number) for number in numbers] if what != "drivable" else []
     if what == "q-learning":
         q_learning()
     elif what == "zero-shot":
@@ -273,6 +293,8 @@ if __name__ == "__main__":
         ppo_settings(seeds or range(3))
     elif what == "randomization":
         randomization()
+    elif what == "drivable":
+        drivable(numbers)
     elif what == "sac":
         sac(seeds or range(2))
     else:

@@ -26,6 +26,7 @@ from gridnav.envs import (
     Randomization,
     Range,
 )
+from gridnav.experiment.drivability import try_driving
 from gridnav.experiment.evaluation import EVALUATION_SEED, evaluate_in
 from gridnav.experiment.results import open_log
 from gridnav.experiment.rollouts import Rollouts, load_rollouts, save_rollouts
@@ -576,6 +577,20 @@ def test_a_robot_with_more_yaw_inertia_takes_longer_to_turn() -> None:
         return float(env.step(np.array([[0.0, 1.0]]))[-1]["pose"][0, 2])
 
     assert turned(30.0) < 0.9 * turned(1.0)
+
+
+@pytest.mark.parametrize("preset", ["burger", "wide", "force-only"])
+def test_robots_of_a_preset_can_drive_whatever_else_they_cannot(preset: str) -> None:
+    assert try_driving(Randomization.load(preset), 256).share >= 0.97
+
+
+def test_robots_fall_where_their_weight_lies_on_the_axle_and_slip_where_the_wheels_carry_little() -> None:
+    heavy_nose = try_driving(Randomization.fixed(centre_x_m=0.03), 4)
+    light_wheels = try_driving(Randomization.fixed(centre_x_m=-0.034, wheel_friction=0.25, floor_tilt_rad=0.05), 4)
+
+    assert heavy_nose.falls.all()
+    assert heavy_nose.share == light_wheels.share == 0.0
+    assert light_wheels.slips.all()
 
 
 def test_pushes_come_at_their_intervals_and_are_as_strong_as_drawn() -> None:

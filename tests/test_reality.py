@@ -11,6 +11,7 @@ import pytest
 from gridnav.agents import Planner
 from gridnav.envs import RANDOMIZATION_PRESETS, Randomization
 from gridnav.experiment import reality
+from gridnav.experiment.drivability import try_driving
 from gridnav.experiment.reality import REALITIES, find_reality
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.types import InputError
@@ -80,6 +81,12 @@ def test_the_numbers_of_the_parametric_one_lie_beyond_those_of_training() -> Non
         ours, theirs = getattr(beyond, name), getattr(trained, name)
         assert ours.low >= theirs.high or ours.high <= theirs.low, name
     assert len(beyond.names) > 25
+
+
+def test_a_robot_of_an_open_reality_can_drive() -> None:
+    for one in map(find_reality, ("parametric", "structural")):
+        options = {"edit_model": one.edit_model, "timestep_s": one.timestep_s}
+        assert try_driving(one.randomization, 128, **options).share >= 0.98, one.name
 
 
 # ---- The structural one --------------------------------------------------------------------------

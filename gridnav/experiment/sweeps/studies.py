@@ -22,8 +22,10 @@ UNDER = {"none": "none", "burger": "burger", "wide": "wide"}
 """Where agents of the presets are evaluated."""
 WHOLE = "whole"
 """A training of its preset's length."""
-SHORT = {"none": {"1/10": 48_000, "3/10": 144_000}, "wide": {"1/10": 144_000, "3/10": 432_000}}
-"""Steps of short trainings, by their share of the whole: so there are policies of every quality to foretell."""
+TENTH = "1/10"
+"""A tenth of that: so there are policies of every quality to foretell."""
+SHORT = {"none": 48_000, "wide": 96_000}
+"""Steps of those, by where they train."""
 STRENGTHS = tuple(k / 4 for k in range(9))
 REACHES = (0.5, 1.0, 1.5, 2.0)
 """How far a quantity goes from its nominal value, as a share of the way to either end of its range."""
@@ -82,10 +84,7 @@ def _plan_arms(wish: Wish) -> list[Draft]:
 def _plan_presets(wish: Wish) -> list[Draft]:
     whole = [_preset(preset, WHOLE, seed, ()) for preset in RANDOMIZATION_PRESETS for seed in wish.seeds]
     short = [
-        _preset(preset, share, seed, (f"steps={steps}",))
-        for preset, lengths in SHORT.items()
-        for share, steps in lengths.items()
-        for seed in wish.seeds
+        _preset(preset, TENTH, seed, (f"steps={steps}",)) for preset, steps in SHORT.items() for seed in wish.seeds
     ]
     return whole + short
 
