@@ -363,8 +363,8 @@ _BURGER = Randomization(
     goal_noise_m=Range(0.0, 0.03),
 )
 
-# Half as wide again, but for the centre of mass: further ahead the robot falls on its nose when it stops, further back
-# its wheels lose their hold.
+# Half as wide again, but for the centre of mass along the robot: further ahead it falls on its nose when it stops,
+# further back its wheels lose their hold.
 _WIDE = replace(_BURGER.scaled(1.5), centre_x_m=_BURGER.centre_x_m)
 
 PRESETS: dict[str, Randomization] = {

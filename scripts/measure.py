@@ -11,8 +11,8 @@ python scripts/measure.py ppo-settings [SEED ...]   PPO's environments, rollout,
 python scripts/measure.py sac [SEED ...]            SAC of stable-baselines3 on DiffDrive, success against time
 python scripts/measure.py randomization             what randomising 256 DiffDrives costs, by preset and by quantity
 python scripts/measure.py drivable [RANDOMIZATION ...]
-                                                    robots that fall or slip whatever they are told, of randomizations
-                                                    or of all presets and the realities that are open
+                                                    robots that fall over or stay where they are when told to drive
+                                                    squares: of these, or of all presets and the open realities
 """
 
 import sys
@@ -32,7 +32,7 @@ from gridnav.experiment.evaluation import evaluate, policy_for
 from gridnav.experiment.ladder import steps_to
 from gridnav.experiment.reality import find_reality
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
-from gridnav.experiment.training import BUDGETS, Choice, Job, Workshop, carry_weights, make_learner
+from gridnav.experiment.training import BUDGETS, Choice, Job, Workshop, carry_weights, make_learner, unseen
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.metrics import Summary, summarise
 
@@ -211,18 +211,15 @@ def randomization(num_envs: int = 256, rounds: int = 9, steps: int = 20) -> None
 
 
 def drivable(sources: Sequence[str], n: int = 1000) -> None:
-    """Robots that fall over or slip where they stand, driving squares on an open floor."""
+    """Robots that fall over, or hardly move or turn, when they are told to drive squares on an open floor."""
     presets = [name for name in RANDOMIZATION_PRESETS if name != "curriculum"]  # which ends where `wide` does
     cases = {name: (Randomization.load(name), {}) for name in sources or presets}
     if not sources:
-        realities = {name: find_reality(name) for name in ("parametric", "structural")}
-        cases |= {
-            name: (one.randomization, {"edit_model": one.edit_model, "timestep_s": one.timestep_s})
-            for name, one in realities.items()
-        }
+        realities = [find_reality(name) for name in ("parametric", "structural")]
+        cases |= {one.name: (one.randomization, one.options) for one in realities}
     for name, (randomization, options) in cases.items():
         found = try_driving(randomization, n, **options)
-        print(f"{name}: {found.falls.mean():.1%} fall, {found.slips.mean():.1%} slip where they stand", flush=True)
+        print(f"{name}: {found.falls.mean():.1%} fall, {found.stays.mean():.1%} hardly move or turn", flush=True)
 
 
 def ppo_settings(seeds: Sequence[int]) -> None:
@@ -271,12 +268,12 @@ def _workshop(seed: int, problem: Problem = PROBLEM) -> Iterator[tuple[Workshop,
         RunDirectory.create(Path(folder) / "run", "measure", {}) as run,
         MetricsLog(run) as log,
     ):
-        yield Workshop(Job(problem, BUDGET, seed, run, lambda name: lambda progress: None), log), log
+        yield Workshop(Job(problem, BUDGET, seed, run, unseen), log), log
 
 
 if __name__ == "__main__":
-    what, *numbers = sys.argv[1:] or ["help"]
-    seeds = [int(number) for number in numbers] if what != "drivable" else []
+    what, *words = sys.argv[1:] or ["help"]
+    seeds = [int(word) for word in words if word.isdecimal()]
     if what == "q-learning":
         q_learning()
     elif what == "zero-shot":
@@ -294,7 +291,7 @@ if __name__ == "__main__":
     elif what == "randomization":
         randomization()
     elif what == "drivable":
-        drivable(numbers)
+        drivable(words)
     elif what == "sac":
         sac(seeds or range(2))
     else:

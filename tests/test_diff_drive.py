@@ -35,12 +35,6 @@ def drive(env: Any, forward: float, turn: float, steps: int) -> list[dict[str, A
     return [env.step(commands)[4] for _ in range(steps)]
 
 
-def tilts_deg(env: Any) -> np.ndarray:
-    """Angle between each robot's z axis and the vertical, degrees."""
-    _, x, y, _ = env._qpos[:, 3:7].T
-    return np.degrees(np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1)))
-
-
 def wall_gaps(points: np.ndarray, layout: Layout) -> np.ndarray:
     """Distance of points to the nearest wall by plain geometry: merged rectangles and the outer edge."""
     width, height = layout.size_m
@@ -141,6 +135,18 @@ def test_it_drives_straight_and_nearly_as_fast_as_told(forward: float, share: fl
     steady = (poses[-1, 0] - poses[10, 0]) / (0.2 * (steps - 11))
     assert steady / (forward * V) == pytest.approx(share, abs=0.02)
     assert steady / (forward * V) < 1.0
+
+
+def test_a_robot_leans_by_the_angle_between_its_up_and_the_world_s_and_a_turn_does_not_count() -> None:
+    env = start(n=3)
+    half = np.deg2rad(15.0)
+    env._qpos[:, 3:7] = [
+        [np.cos(half), 0.0, np.sin(half), 0.0],  # nose down
+        [np.cos(half), 0.0, 0.0, np.sin(half)],  # to the left
+        [0.0, 1.0, 0.0, 0.0],  # on its back
+    ]
+
+    np.testing.assert_allclose(np.degrees(env.lean_rad), [30.0, 0.0, 180.0], atol=1e-5)
 
 
 def test_it_stops_within_a_centimetre_when_told_to() -> None:
@@ -322,7 +328,7 @@ def test_a_robot_that_drives_into_a_wall_stops_there(angle: float, forward: floa
     hits = np.flatnonzero([info["collision"][0] for info in infos])
     assert np.diff(hits).tolist() == [13] * ((59 - hits[0]) // 13)
     assert np.hypot(*(poses[-1] - poses[-20])[:2]) < 1e-4  # it rests, and does not creep along the wall
-    assert tilts_deg(env).max() < 2.0
+    assert np.degrees(env.lean_rad).max() < 2.0
 
 
 @pytest.mark.parametrize("forward", [1.0, -1.0])
@@ -364,7 +370,7 @@ def test_sliding_along_a_wall_is_charged_in_every_step_of_it() -> None:
     assert np.mean(pressed) > 0.8
     assert all((info["reward_terms"]["collision"][0] < 0) == info["collision"][0] for info in infos)
     assert infos[-1]["pose"][0, 1] - infos[first]["pose"][0, 1] > 0.05
-    assert tilts_deg(env).max() < 8.0
+    assert np.degrees(env.lean_rad).max() < 8.0
 
 
 @pytest.mark.parametrize("on_collision", ["stop", "slide"])
@@ -390,7 +396,7 @@ def test_no_random_full_speed_drive_tunnels_tips_or_sinks(name: str, on_collisio
         hits += int(final["collision"].sum())
         assert wall_gaps(final["pose"][:, :2], layout).min() > BURGER.radius_m - 5e-3
         assert np.hypot(*(final["pose"] - before)[:, :2].T).max() < 1.5 * V * 0.2
-        assert tilts_deg(env).max() < 8.0
+        assert np.degrees(env.lean_rad).max() < 8.0
         # Reversing into a wall at full speed rocks the robot on its caster: a few millimetres at the axle.
         assert np.abs(env._qpos[:, 2] - 0.033).max() < 8e-3
         before = info["pose"]

@@ -1,18 +1,17 @@
 """Evaluation, training and the ladder on the real worlds, small."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from gridnav.agents import Planner, Progress
+from gridnav.agents import Planner
 from gridnav.experiment.evaluation import evaluate, policy_for
 from gridnav.experiment.ladder import climb
 from gridnav.experiment.robot_lint import lint_robot
 from gridnav.experiment.run_directory import MetricsLog, RunDirectory
-from gridnav.experiment.training import Budget, Job
+from gridnav.experiment.training import Budget, Job, unseen
 from gridnav.experiment.worlds import Problem, make_worlds
 from gridnav.problem.layout import Layout
 from gridnav.problem.metrics import summarise
@@ -26,10 +25,6 @@ PROBLEM = Problem.load("classic", "default", "default")
 @pytest.fixture(scope="module")
 def planner() -> Planner:
     return Planner.solve(PROBLEM.layout, PROBLEM.task, PROBLEM.reward)
-
-
-def quiet(name: str) -> Callable[[Progress], None]:
-    return lambda progress: None
 
 
 @pytest.mark.parametrize("world", ["GridWorld", "Unicycle", "DiffDrive"])
@@ -97,7 +92,7 @@ def test_the_ladder_climbs_and_writes_everything(tmp_path: Path) -> None:
     budget = Budget(share=4_096 / 800_000, episodes=4)
 
     with RunDirectory.create(tmp_path / "run", "ladder", {"command": "ladder"}) as run:
-        results = climb(Job(PROBLEM, budget, 0, run, quiet, {"seed": 0}, "gridnav ladder"))
+        results = climb(Job(PROBLEM, budget, 0, run, unseen, {"seed": 0}, "gridnav ladder"))
 
     by_name = {result.name: result.summary.success_rate for result in results}
     assert list(by_name)[:4] == ["plan", "q-learning", "q-table-unicycle", "q-table-diffdrive"]

@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from rerun.experimental import ViewerClient
 
-from gridnav.agents import Progress
 from gridnav.display.viewer import ViewerError, address_of, free_port, headless_viewer, wait_until
 from gridnav.experiment.live import Spectator, Watch
 from gridnav.experiment.results import open_log
 from gridnav.experiment.run_directory import RunDirectory
-from gridnav.experiment.training import Budget, Choice, Job, Trained, Workshop
+from gridnav.experiment.training import Budget, Choice, Job, Trained, Workshop, unseen
 from gridnav.experiment.worlds import Problem
 
 PROBLEM = Problem.load("S...\n.#..\n...G", "default", "default")
 
 
 def train(path: Path, spectator: Spectator | None) -> Trained:
-    def quiet(name: str) -> Callable[[Progress], None]:
-        return lambda progress: None
-
     with RunDirectory.create(path, "train", {}) as run, open_log(run) as log:
-        workshop = Workshop(Job(PROBLEM, Budget(0.2, 2), 0, run, quiet, spectator=spectator), log)
+        workshop = Workshop(Job(PROBLEM, Budget(0.2, 2), 0, run, unseen, spectator=spectator), log)
         return workshop.train("q", "q-learning", "GridWorld", choice=Choice(changes={"num_envs": "16", "visits": "50"}))
 
 

@@ -16,6 +16,7 @@ from gridnav.experiment.checkpoint import save_agent
 from gridnav.experiment.rollouts import load_rollouts, names
 from gridnav.experiment.run_directory import RunDirectory, write_json
 from gridnav.experiment.sim_to_real import SEALED_LOG, correlation, measure, measure_once
+from gridnav.experiment.training import unseen
 from gridnav.experiment.worlds import Problem
 
 CORRIDOR = "S..G\n"
@@ -112,7 +113,7 @@ def test_runs_measured_in_workers_have_the_numbers_they_have_alone_and_are_measu
 
     found = measure_once(runs, ["parametric"], 2, on_stage, jobs=2)
 
-    (alone,) = measure([runs["one"]], ["parametric"], 2, lambda name: lambda progress: None)
+    (alone,) = measure([runs["one"]], ["parametric"], 2, unseen)
     for name, gap in found.items():
         assert (gap.policy, gap.at_home, gap.away) == (name, alone.at_home, alone.away)
     assert told == [1, 2]

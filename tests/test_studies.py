@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 from command_line import run_cli
 from matplotlib import pyplot as plt
 
-from gridnav.agents import PPO_PRESETS, Progress
+from gridnav.agents import PPO_PRESETS
 from gridnav.display.responses import Panel, Response, responses
 from gridnav.envs import PARAMETERS, RANDOMIZATION_PRESETS, Randomization
 from gridnav.experiment.run_directory import RunDirectory, write_json
@@ -18,6 +18,7 @@ from gridnav.experiment.sim_to_real import MEASURED
 from gridnav.experiment.sweeps.findings import write_study
 from gridnav.experiment.sweeps.studies import GROUPS, Draft, Wish, plan
 from gridnav.experiment.sweeps.sweep import Outcome, Trial
+from gridnav.experiment.training import unseen
 from gridnav.problem.metrics import Summary
 from gridnav.problem.types import InputError
 
@@ -107,7 +108,7 @@ def test_the_default_study_is_arms_and_presets() -> None:
     drafts = plan("default", Wish(seeds=(0, 1, 2)))
 
     parts = [one.settings["study"] for one in drafts]
-    # By hand: two trainings that end early, beside the whole ones.
+    # By hand: two short trainings beside the whole ones.
     assert parts == ["arms"] * 3 + ["presets"] * 3 * (len(RANDOMIZATION_PRESETS) + 2)
 
 
@@ -167,10 +168,6 @@ def conclude(study: str, drafts: list[Draft], successes: Mapping[tuple[str, str]
     ]
     with RunDirectory.create(Path("study"), "sweep", {}) as sweep:
         return write_study(study, trials, outcomes, sweep, unseen, jobs=1, command="", config={})
-
-
-def unseen(name: str) -> Callable[[Progress], None]:
-    return lambda progress: None
 
 
 def row(success: float, under: str) -> dict[str, object]:

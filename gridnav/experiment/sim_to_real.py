@@ -22,7 +22,7 @@ from gridnav.experiment.evaluation import evaluate_in
 from gridnav.experiment.reality import WORLD, Reality, find_reality
 from gridnav.experiment.results import stored_evaluation, write_evaluation, write_rollouts
 from gridnav.experiment.run_directory import RunDirectory, read_json, write_json
-from gridnav.experiment.training import OnStage, Result
+from gridnav.experiment.training import OnStage, Result, unseen
 from gridnav.experiment.workers import in_workers
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.metrics import Summary, summarise
@@ -164,7 +164,7 @@ def _is_measured(run: RunDirectory, asked: Mapping[str, Any]) -> bool:
 def _measure_run(path: Path, asked: Mapping[str, Any]) -> None:
     """In a worker: the last policy of a run, whose numbers go there."""
     run = RunDirectory.open(path)
-    gap = measure([run], asked["realities"], asked["episodes"], lambda name: lambda progress: None)[-1]
+    gap = measure([run], asked["realities"], asked["episodes"], unseen)[-1]
     there = {place: asdict(summary) for place, summary in gap.away.items()}
     write_json(run.path / MEASURED, {**asked, "home": asdict(gap.at_home), "away": there})
 

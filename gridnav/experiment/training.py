@@ -200,6 +200,11 @@ OnStage = Callable[[str], OnProgress]
 """Told what begins, in words; gives what is to be told of its progress."""
 
 
+def unseen(name: str) -> OnProgress:
+    """A stage whose progress nobody watches."""
+    return lambda progress: None
+
+
 @dataclass(frozen=True)
 class Job:
     """A run to be made: of what, with how much, where, and who is told."""

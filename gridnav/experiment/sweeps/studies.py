@@ -23,9 +23,9 @@ UNDER = {"none": "none", "burger": "burger", "wide": "wide"}
 WHOLE = "whole"
 """A training of its preset's length."""
 TENTH = "1/10"
-"""A tenth of that: so there are policies of every quality to foretell."""
+"""A training of a tenth of those steps: a correlation needs policies that differ in quality."""
 SHORT = {"none": 48_000, "wide": 96_000}
-"""Steps of those, by where they train."""
+"""Steps of such a training, by the randomization it trains under."""
 STRENGTHS = tuple(k / 4 for k in range(9))
 REACHES = (0.5, 1.0, 1.5, 2.0)
 """How far a quantity goes from its nominal value, as a share of the way to either end of its range."""

@@ -11,7 +11,7 @@ from typing import Any
 from gridnav.experiment.checkpoint import clear_leftovers
 from gridnav.experiment.course import CHECKPOINT_S
 from gridnav.experiment.run_directory import RunDirectory, write_json
-from gridnav.experiment.training import BUDGETS, Job, Result, Training
+from gridnav.experiment.training import BUDGETS, Job, Result, Training, unseen
 from gridnav.experiment.worlds import Problem
 from gridnav.problem.types import InputError
 
@@ -108,7 +108,7 @@ def _ladder(config: Mapping[str, Any], run: RunDirectory, checkpoint_s: float) -
 
 def _job(config: Mapping[str, Any], problem: Problem, run: RunDirectory, checkpoint_s: float) -> Job:
     budget = BUDGETS[config["budget"]]
-    return Job(problem, budget, config["seed"], run, _unseen, config, checkpoint_s=checkpoint_s)
+    return Job(problem, budget, config["seed"], run, unseen, config, checkpoint_s=checkpoint_s)
 
 
 def _evaluate(config: Mapping[str, Any], run: RunDirectory, checkpoint_s: float) -> list[Result]:
@@ -119,7 +119,7 @@ def _again(run: RunDirectory, n_episodes: int, randomization: str) -> list[Resul
     """The robots of a finished run, evaluated anew; nothing varies on the grid."""
     from gridnav.experiment.results import evaluate_again
 
-    results = evaluate_again(run, n_episodes, None, _unseen, randomization=randomization)
+    results = evaluate_again(run, n_episodes, None, unseen, randomization=randomization)
     return [result for result in results if result.world != "GridWorld"]
 
 
@@ -129,11 +129,6 @@ TRIALS: dict[str, Callable[[Mapping[str, Any], RunDirectory, float], list[Result
     "evaluate": _evaluate,
 }
 """What a trial can do, by the name of the command that does it alone."""
-
-
-def _unseen(name: str) -> Callable[[Any], None]:
-    """Nobody watches a trial."""
-    return lambda progress: None
 
 
 def row_of(result: Result) -> Row:
