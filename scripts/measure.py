@@ -273,7 +273,7 @@ def _workshop(seed: int, problem: Problem = PROBLEM) -> Iterator[tuple[Workshop,
 
 if __name__ == "__main__":
     what, *words = sys.argv[1:] or ["help"]
-    seeds = [int(word) for word in words if word.isdecimal()]
+    seeds = [] if what == "drivable" else [int(word) for word in words]
     if what == "q-learning":
         q_learning()
     elif what == "zero-shot":
