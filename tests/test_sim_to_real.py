@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import run_cli
+from test_studies import summary
 
 from gridnav.agents import Planner, Progress
 from gridnav.experiment import sim_to_real
 from gridnav.experiment.checkpoint import save_agent
 from gridnav.experiment.rollouts import load_rollouts, names
 from gridnav.experiment.run_directory import RunDirectory, write_json
-from gridnav.experiment.sim_to_real import SEALED_LOG, correlation, measure, measure_once
+from gridnav.experiment.sim_to_real import SEALED_LOG, Gap, conclusion, correlation, measure, measure_once
 from gridnav.experiment.training import unseen
 from gridnav.experiment.worlds import Problem
 
@@ -50,6 +51,12 @@ def test_policies_that_are_equal_at_home_foretell_nothing() -> None:
 
     assert np.isnan(found.pearson)
     assert np.isnan(found.pearson_interval).all()
+
+
+def test_the_conclusion_says_so_instead_of_a_number_that_is_none() -> None:
+    gaps = [Gap(name, summary(1.0), {"mars": summary(there)}) for name, there in (("one", 0.25), ("other", 0.5))]
+
+    assert conclusion(gaps).endswith("all 2 policies do equally well at one of the places, so nothing correlates.")
 
 
 def test_evaluate_reality_measures_reports_keeps_and_counts(tmp_path: Path) -> None:

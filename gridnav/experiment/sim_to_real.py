@@ -324,11 +324,21 @@ def conclusion(gaps: Sequence[Gap]) -> str:
         )
         if len(gaps) > 1:
             found = correlation(home_and_away(gaps, name))
-            low, high = found.pearson_interval
-            words += f"; over {found.n_policies} policies success at home and there correlate by {found.pearson:.2f} "
-            words += f"({low:.2f} to {high:.2f}{'' if found.n_policies >= ENOUGH_POLICIES else '; too few to rely on'})"
+            words += f"; {_correlated(found)}"
         sentences.append(words + ".")
     return " ".join(sentences)
+
+
+def _correlated(found: Correlation) -> str:
+    """How success at home and in a reality go together."""
+    if np.isnan(found.pearson):
+        return f"all {found.n_policies} policies do equally well at one of the places, so nothing correlates"
+    low, high = found.pearson_interval
+    caution = "" if found.n_policies >= ENOUGH_POLICIES else "; too few to rely on"
+    return (
+        f"over {found.n_policies} policies success at home and there correlate by {found.pearson:.2f} "
+        f"({low:.2f} to {high:.2f}{caution})"
+    )
 
 
 def _success_in(reality: str) -> Callable[[Gap], float]:
