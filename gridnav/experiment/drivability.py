@@ -52,10 +52,9 @@ def try_driving(randomization: Randomization, n_robots: int, *, seed: int = 0, *
         options: For the environments: how the model differs, for example.
     """
     bodies = [name for name in randomization.names if PARAMETERS[name].acts_on in ("physics", "drive")]
-    drawn = replace(randomization.only(*bodies), curriculum=False)
-    problem = Problem.load(FLOOR, "default", "default")
+    problem = replace(Problem.load(FLOOR, "default", "default"), randomization=randomization.only(*bodies))
     # Without autoreset a robot whose physics fails stays where it is, and is seen to.
-    worlds = problem.worlds("DiffDrive", n_robots, randomization=drawn, autoreset=False, **options)
+    worlds = problem.for_evaluation.worlds("DiffDrive", n_robots, autoreset=False, **options)
     assert isinstance(worlds, DiffDriveVectorEnv)
     _, info = worlds.reset(seed=seed)
     now, falls, stays = info["pose"], np.zeros(n_robots, dtype=bool), np.zeros(n_robots, dtype=bool)
