@@ -253,6 +253,8 @@ class Sweep:
     """Finished runs that one-at-a-time and strength evaluate, which also take --randomization and --episodes."""
     quantities: tuple[str, ...] = ()
     """Of the randomization, for leave-one-out, one-at-a-time and strength; or drive, physics, command, sense."""
+    randomizations: tuple[str, ...] = ()
+    """What the study presets compares, such as none wide mine.json; all presets by default."""
     grid: tuple[str, ...] = ()
     """Fields with the values to combine, such as seed=0,1,2 set.learning_rate=0.001,0.003 layout=classic,u-trap."""
     random: tuple[str, ...] = ()
@@ -321,7 +323,7 @@ class Sweep:
 
         if not self.grid and not self.random:
             raise InputError("a sweep needs something to vary: --grid seed=0,1,2, --random FIELD=LAW or --study NAME")
-        self._leave_out("seeds", "runs", "quantities", because="is for a --study")
+        self._leave_out("seeds", "runs", "quantities", "randomizations", because="is for a --study")
         if not 0 <= self.design_seed < 2**32:
             raise InputError(f"--design-seed {self.design_seed} is outside 0 to 4294967295")
         shared = self._shared(self.trial)
@@ -338,6 +340,8 @@ class Sweep:
         from gridnav.experiment.sweeps.sweep import Trial
 
         self._leave_out("grid", "random", "n_trials", "design_seed", "trial", because="goes without --study")
+        if self.study not in ("presets", "default"):
+            self._leave_out("randomizations", because="is for the studies presets and default")
         evaluates = self.study in EVALUATING
         if evaluates:
             self._leave_out("seeds", because="is for studies that train")
@@ -345,15 +349,17 @@ class Sweep:
             if not 1 <= finished.episodes <= 100_000:
                 raise InputError(f"--episodes {finished.episodes} is outside 1 to 100000")
             shared = json.loads(json.dumps(asdict(finished)))
-            wish = Wish((), finished.randomization, self.quantities, "", self.runs, finished.episodes)
+            wish = Wish((), finished.randomization, self.quantities, runs=self.runs, episodes=finished.episodes)
         else:
             self._leave_out("runs", because="is for the studies one-at-a-time and strength")
             shared = self._shared("ladder" if self.study in ("arms", "default") else "train")
             seeds = (10 if shared["budget"] == "full" else 3) if self.seeds is None else self.seeds
             if not 1 <= seeds <= 1000:
                 raise InputError(f"--seeds {seeds} is outside 1 to 1000")
+            if self.study == "presets" and "randomization" in shared:
+                raise InputError("--randomization is one for all: leave it out, or name several as --randomizations")
             arms = shared.get("arms") or ""
-            wish = Wish(range(seeds), shared.get("randomization", ""), self.quantities, arms)
+            wish = Wish(range(seeds), shared.get("randomization", ""), self.quantities, self.randomizations, arms)
         trials = []
         for number, draft in enumerate(plan(self.study, wish)):
             config = draft.fields
@@ -378,6 +384,10 @@ class Sweep:
         own = {name: value for name in OF_A_SWEEP if (value := getattr(self, name)) != getattr(Sweep, name)}
         if self.runs:
             own["runs"] = [str(path.resolve()) for path in self.runs]
+        if self.randomizations:
+            own["randomizations"] = [
+                one if one in RANDOMIZATION_PRESETS else str(Path(one).resolve()) for one in self.randomizations
+            ]
         return json.loads(json.dumps({"command": "sweep", **shared, **own}))
 
     def _leave_out(self, *names: str, because: str) -> None:
@@ -396,7 +406,9 @@ class _Finished:
     """Of each evaluation."""
 
 
-OF_A_SWEEP = ("study", "seeds", "runs", "quantities", "trial", "grid", "random", "n_trials", "design_seed")
+OF_A_SWEEP = (
+    "study", "seeds", "runs", "quantities", "randomizations", "trial", "grid", "random", "n_trials", "design_seed",
+)  # fmt: skip
 """Flags of a sweep that are part of its configuration, beside those that its trials have in common."""
 
 

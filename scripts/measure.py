@@ -10,6 +10,7 @@ python scripts/measure.py ppo-warm [SEED ...]       PPO on DiffDrive, warm-start
 python scripts/measure.py ppo-settings [SEED ...]   PPO's environments, rollout, batch, epochs and network compared
 python scripts/measure.py sac [SEED ...]            SAC of stable-baselines3 on DiffDrive, success against time
 python scripts/measure.py randomization             what randomising 256 DiffDrives costs, by preset and by quantity
+python scripts/measure.py randomized-training       what it costs a training of PPO, of the same settings
 python scripts/measure.py drivable [RANDOMIZATION ...]
                                                     robots that fall over or stay where they are when told to drive
                                                     squares: of these, or of all presets and the open realities
@@ -210,6 +211,33 @@ def randomization(num_envs: int = 256, rounds: int = 9, steps: int = 20) -> None
         print(f"{name}: {np.median(ratios):.2f} ({ratios.min():.2f} to {ratios.max():.2f})", flush=True)
 
 
+def randomized_training(rounds: int = 5, steps: int = 81_920) -> None:
+    """Steps per second of PPO's default training, physics and network together; the cases take turns."""
+    from gridnav.agents import PPOAgent, PPOConfig
+
+    taken: dict[str, list[float]] = {"none": [], "burger": [], "wide": []}
+    for _ in range(rounds + 1):
+        for name, seconds in taken.items():
+            config = PPOConfig(steps=steps)
+            randomization = Randomization.load(name)
+            worlds = PROBLEM.worlds("DiffDrive", config.num_envs, randomization=randomization)
+            agent = PPOAgent(worlds.single_observation_space, worlds.single_action_space, config)
+            began = time.perf_counter()
+            agent.learn(worlds, steps=steps)
+            seconds.append(time.perf_counter() - began)
+            worlds.close()
+    # The first round compiles and warms up.
+    base = np.array(taken["none"][1:])
+    for name, seconds in taken.items():
+        ratios = base / np.array(seconds[1:])
+        speeds = steps / np.array(seconds[1:])
+        print(
+            f"{name}: {np.median(ratios):.2f} ({ratios.min():.2f} to {ratios.max():.2f}), "
+            f"{np.median(speeds):,.0f} steps/s",
+            flush=True,
+        )
+
+
 def drivable(sources: Sequence[str], n: int = 1000) -> None:
     """Robots that fall over, or hardly move or turn, when they are told to drive squares on an open floor."""
     presets = [name for name in RANDOMIZATION_PRESETS if name != "curriculum"]  # which ends where `wide` does
@@ -290,6 +318,8 @@ if __name__ == "__main__":
         ppo_settings(seeds or range(3))
     elif what == "randomization":
         randomization()
+    elif what == "randomized-training":
+        randomized_training()
     elif what == "drivable":
         drivable(words)
     elif what == "sac":

@@ -57,6 +57,18 @@ def test_presets_has_short_trainings_so_that_policies_differ_in_quality() -> Non
         assert one.settings["training"] == "1/10"
 
 
+def test_presets_compares_those_that_were_named_and_files_by_their_names() -> None:
+    Path("slow.json").write_text('{"command_delay_s": [0.1, 0.2]}')
+
+    drafts = plan("presets", Wish(seeds=(0,), randomizations=("none", "slow.json")))
+
+    # By hand: each whole, and `none` for a tenth of its steps as well.
+    assert [(one.settings["randomization"], one.settings["training"]) for one in drafts] == [
+        ("none", "whole"), ("slow", "whole"), ("none", "1/10"),
+    ]  # fmt: skip
+    assert Randomization.load(drafts[1].fields["randomization"]).names == ("command_delay_s",)
+
+
 def test_leave_one_out_leaves_out_one_group_at_a_time() -> None:
     drafts = plan("leave-one-out", Wish(seeds=(0,)))
 
@@ -122,10 +134,16 @@ def test_the_default_study_is_arms_and_presets() -> None:
         ("leave-one-out", Wish(quantities=["wheel_radios"]), "wheel_radius"),
         ("leave-one-out", Wish(quantities=["command"], randomization="force-only"), "command"),
         ("leave-one-out", Wish(randomization="burgr"), "burgr"),
+        ("presets", Wish(randomizations=["none", "burgr"]), "burgr"),
+        ("presets", Wish(randomizations=["none", "none"]), "none"),
+        ("presets", Wish(randomizations=["none", "wide.json"]), "rename"),
+        ("presets", Wish(randomizations=['{"mass": 1.1}']), "file"),
+        ("presets", Wish(randomizations=["missing.json"]), "missing.json"),
     ],
 )
 def test_what_no_study_can_do_is_refused(study: str, wish: Wish, named: str) -> None:
     finished(Path("run"))
+    Path("wide.json").write_text('{"mass": 1.1}')
 
     with pytest.raises(InputError, match=named):
         plan(study, wish)
@@ -144,6 +162,9 @@ def test_what_no_study_can_do_is_refused(study: str, wish: Wish, named: str) -> 
         (["--study", "strength", "--layout", "open"], "--layout"),
         (["--study", "strength", "--runs", "a", "--episodes", "0"], "--episodes 0"),
         (["--seeds", "3", "--grid", "seed=0,1"], "--seeds"),
+        (["--study", "presets", "--randomization", "wide"], "--randomizations"),
+        (["--study", "arms", "--randomizations", "wide"], "--randomizations"),
+        (["--study", "presets", "--randomizations", "none", "burgr"], "burgr"),
     ],
 )
 def test_bad_flags_get_one_line_and_nothing_is_written(

@@ -90,9 +90,12 @@ def _find_presets(done: Sequence[Done], sweep: RunDirectory, measured: Measured)
     for one, gap in zip(finished, gaps, strict=True):
         if one in whole:
             by_preset[one.trial.settings["randomization"]].append(gap)
+    tables = [_kept_table(by_preset), table]
+    if sum(one in whole for one in finished) > 1:
+        tables.append(_foretelling(finished, gaps))
     return Findings(
         " ".join(_kept_words(by_preset, place) for place in DEVELOPMENT),
-        [_kept_table(by_preset), table, _foretelling(finished, gaps)],
+        tables,
         {"realities": _kept_picture(by_preset), "presets": Picture(success_bars(bars, target=None), caption)},
     )
 
@@ -117,7 +120,9 @@ def _foretelling(done: Sequence[Done], gaps: Sequence[Gap]) -> Table:
             float(row["success"]) for one in done for row in one.outcome.rows if row["under"] == under
         ]
     whole = np.flatnonzero([one.trial.settings["training"] == WHOLE for one in done])
-    groups = {f"{len(whole)} whole trainings": whole, f"all {len(gaps)}": np.arange(len(gaps))}
+    groups = {f"{len(whole)} whole trainings": whole}
+    if len(whole) < len(gaps):
+        groups[f"all {len(gaps)}"] = np.arange(len(gaps))
     rows = []
     for name, successes in simulated.items():
         words = []
@@ -141,16 +146,16 @@ def _kept_table(gaps: Mapping[str, Sequence[Gap]]) -> Table:
     rows = []
     for name, here in gaps.items():
         for place in DEVELOPMENT:
-            kept = [gap.retention(place)[0] for gap in here]
+            _, *own = here[0].retention(place)
+            kept, low, high = _over_seeds([gap.retention(place)[0] for gap in here], (own[0], own[1]))
             away = [gap.away[place] for gap in here]
             successes = [_successes([gap.at_home for gap in here]), _successes(away)]
             rows.append(
-                [name, place, *map(percent_interval, successes),
-                 f"{float(iqm(kept)):.2f} ({min(kept):.2f} to {max(kept):.2f})",
+                [name, place, *map(percent_interval, successes), f"{kept:.2f} ({low:.2f} to {high:.2f})",
                  percent(float(iqm([one.collision_rate for one in away])))]
             )  # fmt: skip
     columns = ("trained under", "reality", "success at home", "success there", "kept", "collided there")
-    legend = f"Home is what the policy was trained under. Kept: mean and range over seeds. {OVER_SEEDS}"
+    legend = f"Home is what the policy was trained under. Kept: success there over success at home. {OVER_SEEDS}"
     return Table("What was kept in worlds that no training saw", columns, rows, legend)
 
 

@@ -48,6 +48,8 @@ class Wish:
     """A preset, a JSON file or JSON text; the runs' own or ``burger`` by default."""
     quantities: Sequence[str] = ()
     """Of that randomization, or groups of them; all by default."""
+    randomizations: Sequence[str] = ()
+    """Which are compared: presets and JSON files; all presets by default."""
     arms: str = ""
     """Names of arms of transfer with commas between; all by default."""
     runs: Sequence[Path] = ()
@@ -82,16 +84,29 @@ def _plan_arms(wish: Wish) -> list[Draft]:
 
 
 def _plan_presets(wish: Wish) -> list[Draft]:
-    whole = [_preset(preset, WHOLE, seed, ()) for preset in RANDOMIZATION_PRESETS for seed in wish.seeds]
-    short = [
-        _preset(preset, TENTH, seed, (f"steps={steps}",)) for preset, steps in SHORT.items() for seed in wish.seeds
-    ]
-    return whole + short
+    compared = _compared(wish.randomizations or tuple(RANDOMIZATION_PRESETS))
+    drafts = []
+    for training, steps in ((WHOLE, dict.fromkeys(compared)), (TENTH, SHORT)):
+        for name in [one for one in compared if one in steps]:
+            changes = () if steps[name] is None else (f"steps={steps[name]}",)
+            for seed in wish.seeds:
+                settings = {"randomization": name, "training": training, "seed": str(seed)}
+                drafts.append(_training(settings, compared[name], seed, UNDER, changes))
+    return drafts
 
 
-def _preset(preset: str, training: str, seed: int, changes: tuple[str, ...]) -> Draft:
-    settings = {"randomization": preset, "training": training, "seed": str(seed)}
-    return _training(settings, preset, seed, UNDER, changes)
+def _compared(sources: Sequence[str]) -> dict[str, str]:
+    """Randomizations by the name that the table has for them: a preset's, or a file's without its ending."""
+    named: dict[str, str] = {}
+    for source in sources:
+        if source.lstrip().startswith("{"):
+            raise InputError(f"--randomizations {source:.40} must be a preset or a JSON file: the table needs a name")
+        Randomization.load(source)  # says what is wrong before anything is trained
+        name = source if source in RANDOMIZATION_PRESETS else Path(source).stem
+        if name in named or (source != name and name in RANDOMIZATION_PRESETS):
+            raise InputError(f"--randomizations {source:.60}: another one is called {name!r:.60}, rename the file")
+        named[name] = source
+    return named
 
 
 def _training(
