@@ -36,7 +36,7 @@ WINDOW = 120
 """Episodes at the present strength by which a curriculum decides."""
 WIDENS, NARROWS = 0.85, 0.6
 """Success from which on ranges widen, and below which they narrow."""
-STEP = 0.1
+STEP = 0.2
 """Of the strength, at each decision."""
 
 
@@ -150,7 +150,8 @@ class Curriculum:
 
     Half of the episodes are at it, the others anywhere below, so that what was learnt is not forgotten (automatic
     domain randomisation, OpenAI et al. 2019, arXiv 1910.07113, section 5). It decides by the first ``WINDOW`` episodes
-    that *begin* at a strength, once all of them have ended: the first to end are the good ones.
+    that *begin* at a strength, not by the first to end, which are the good ones; and as soon as those that are still
+    under way cannot change the decision.
     """
 
     state: FloatArray
@@ -169,7 +170,7 @@ class Curriculum:
         return float(self.state[0])
 
     def note(self, ids: IntArray, is_over: BoolArray, successes: BoolArray) -> None:
-        """These environments leave their episodes: widen or narrow once all that count are over.
+        """These environments leave their episodes: widen or narrow once it is settled.
 
         Args:
             ids: The environments.
@@ -179,11 +180,14 @@ class Curriculum:
         counts, cut = self.is_sample[ids] & is_over, self.is_sample[ids] & ~is_over
         self.is_sample[ids] = False
         self.state[1:] += -cut.sum(), counts.sum(), successes[counts].sum()
-        if self.state[2] >= WINDOW:
-            rate = self.state[3] / self.state[2]
-            change = STEP if rate >= WIDENS else -STEP if rate < NARROWS else 0.0
-            # Rounded, so that ten steps make 1.
+        _, _, ended, arrived = self.state
+        widens = arrived >= WIDENS * WINDOW
+        narrows = ended - arrived > (1.0 - NARROWS) * WINDOW
+        if widens or narrows or ended >= WINDOW:
+            change = STEP if widens else -STEP if narrows else 0.0
+            # Rounded, so that steps make 1.
             self.state[:] = min(max(round(self.strength + change, 6), 0.0), 1.0), 0, 0, 0
+            self.is_sample[:] = False  # those under way were at the strength before
 
     def strength_for(self, ids: IntArray, keys: Keys, episodes: IntArray) -> FloatArray:
         """Strength of the next episode of each environment, shape ``(len(ids),)``."""

@@ -85,6 +85,13 @@ class LayoutMix(VectorEnv[AnyArray, AnyArray, AnyArray]):
         flags = np.concatenate(terminated), np.concatenate(truncated)
         return np.concatenate(observations), np.concatenate(rewards), *flags, _joined(infos)
 
+    @property
+    def curriculum_strength(self) -> float | None:
+        """The mean over the groups; None without a curriculum."""
+        strengths = [group.curriculum_strength for group in self.groups]
+        known = [one for one in strengths if one is not None]
+        return float(np.mean(known)) if known else None
+
     def _new_layout(self) -> dict[str, Any]:
         return {"layout": self._draw(self._layout_rng)}
 

@@ -306,6 +306,11 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         """Discount of one step that matches the reward's discount per cell-time."""
         return float(self.reward.gamma**self.step_duration)
 
+    @property
+    def curriculum_strength(self) -> float | None:
+        """How much of its ranges a curriculum draws from at present, in [0, 1]; None without one."""
+        return None
+
     def start_and_goal(self, i: int) -> tuple[Cell, Cell]:
         """Start and goal cell of environment ``i``'s current episode."""
         (row, col), (goal_row, goal_col) = self._start[i].tolist(), self._goal[i].tolist()

@@ -86,6 +86,11 @@ class RobotVectorEnv(NavigationVectorEnv):
         """Cell-times per control period; a cell-time is a cell at the robot's top speed."""
         return self.control_period_s * self.robot.max_speed_m_s / self.layout.cell_size_m
 
+    @property
+    def curriculum_strength(self) -> float | None:
+        """See ``NavigationVectorEnv.curriculum_strength``."""
+        return self._draws.curriculum.strength if self.randomization.curriculum else None
+
     def _spaces(self) -> tuple[gym.Space[Any], gym.Space[Any]]:
         largest = replace(self.layout, cell_size_m=self.layout.cell_size_m * self.randomization.cell_size.high)
         return FeatureVector(largest, self.robot).space, Box(-1.0, 1.0, (2,), np.float32)

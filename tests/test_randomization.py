@@ -254,6 +254,23 @@ def test_the_curriculum_waits_for_the_slow_episodes_and_does_not_count_what_was_
     assert curriculum.state.tolist() == [0.0, 0, 0, 0]  # two of three arrived: neither wider nor narrower
 
 
+@pytest.mark.parametrize(("arrives", "settled", "change"), [(True, 102, STEP), (False, 49, -STEP)])
+def test_the_curriculum_decides_once_the_episodes_under_way_cannot_change_it(
+    arrives: bool, settled: int, change: float
+) -> None:
+    """By hand: 102 arrivals are 85 % of 120 whatever the others do, 49 failures leave less than 60 %."""
+    curriculum = Curriculum.begin(WINDOW)
+    everyone, alike = np.arange(WINDOW), np.ones(WINDOW, dtype=bool)
+    curriculum.state[:2], curriculum.is_sample[:] = (0.5, WINDOW), True
+
+    curriculum.note(everyone[: settled - 1], alike[: settled - 1], alike[: settled - 1] & arrives)
+    assert curriculum.strength == 0.5
+    curriculum.note(everyone[settled - 1 : settled], alike[:1], alike[:1] & arrives)
+
+    assert curriculum.state.tolist() == [0.5 + change, 0, 0, 0]
+    assert not curriculum.is_sample.any()  # what is under way says nothing of the new strength
+
+
 def test_the_curriculum_begins_with_the_nominal_robot_and_stays_within_its_ranges() -> None:
     wide = RANDOMIZATION_PRESETS["curriculum"]
     draws = draws_of(wide, n=2000, episodes=1)
@@ -1014,6 +1031,8 @@ def test_a_training_with_a_curriculum_that_breaks_off_goes_on_bit_for_bit(tmp_pa
     assert names
     for name in names | {"metrics.jsonl"}:
         assert (whole.path / name).read_bytes() == (broken.path / name).read_bytes(), name
+    rows = [json.loads(line) for line in (whole.path / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
+    assert all(0.0 <= row["curriculum_strength"] <= 1.0 for row in rows if "success_rate" in row)
 
 
 # ---- Documentation -------------------------------------------------------------------------------

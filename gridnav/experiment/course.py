@@ -114,7 +114,9 @@ class Course:
 
     def _on_progress(self, progress: Progress) -> None:
         self._steps = progress.steps
-        self._log.add(self._name, progress.steps, progress.metrics)
+        strength = self._robots.curriculum_strength
+        metrics = progress.metrics if strength is None else {**progress.metrics, "curriculum_strength": strength}
+        self._log.add(self._name, progress.steps, metrics)
         self._report(progress)
 
     def _on_cut(self, training: Callable[[], State]) -> None:
