@@ -114,8 +114,10 @@ class Course:
 
     def _on_progress(self, progress: Progress) -> None:
         self._steps = progress.steps
-        strength = self._robots.curriculum_strength
-        metrics = progress.metrics if strength is None else {**progress.metrics, "curriculum_strength": strength}
+        metrics = dict(progress.metrics)
+        if isinstance(self._robots, NavigationVectorEnv | LayoutMix):
+            strength = self._robots.curriculum_strength
+            metrics |= {} if strength is None else {"curriculum_strength": strength}
         self._log.add(self._name, progress.steps, metrics)
         self._report(progress)
 
