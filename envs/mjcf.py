@@ -93,5 +93,5 @@ def _add_box(
         conaffinity=contact_mask,
         condim=3,
         # Friction combines by the larger value, so the robot's own coefficients decide.
-        friction=[0.01, 0.005, 0.0001],
+        friction=[0.001, 0.005, 0.0001],
     )

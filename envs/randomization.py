@@ -84,7 +84,7 @@ class Randomization:
     mass: Range = _parameter("x", 1.0, 0.3, 3.0, "physics")
     """Of the body, with its inertia."""
     payload_kg: Range = _parameter("kg", 0.0, 0.0, 10.0, "physics")
-    """On top of the body's mass, at its centre."""
+    """On top of the body's mass and spread as that is, so the inertia grows with it."""
     yaw_inertia: Range = _parameter("x", 1.0, 0.1, 30.0, "physics")
     """Of the body; the robot's official files differ by a factor of ten."""
     centre_x_m: Range = _parameter("m", 0.0, -0.05, 0.05, "physics")

@@ -541,6 +541,29 @@ def test_a_unicycle_stands_still_for_the_delay_too(delay_s: float) -> None:
 
 
 @pytest.mark.parametrize("world", WORLDS)
+def test_a_stop_that_comes_too_late_is_a_collision(world: str) -> None:
+    """A robot drives into a wall by its motion, whatever the policy wants by then."""
+    env = make(world, Randomization.fixed(command_delay_s=0.25))
+    _, info = env.reset(seed=0, options={"start": (0, 0), "goal": (9, 9), "heading_rad": np.pi / 2})
+    while info["pose"][0, 1] < env.layout.size_m[1] - env.robot.radius_m - 0.042:
+        *_, info = env.step(np.array([[1.0, 0.0]]))
+    assert info["collisions"][0] == 0
+
+    # By hand: in 0.25 s a robot drives 4 to 5 cm, and the wall is 4.2 cm away at most.
+    for _ in range(5):
+        *_, info = env.step(np.zeros((1, 2)))
+
+    assert info["collisions"][0] == 1
+
+
+def test_the_floor_leaves_the_casters_friction_as_it_is_drawn() -> None:
+    """MuJoCo takes the larger of two frictions."""
+    env = make("DiffDrive", "none")
+
+    assert env.model.geom("floor").friction[0] <= PARAMETERS["caster_friction"].lowest
+
+
+@pytest.mark.parametrize("world", WORLDS)
 def test_wheels_do_not_move_for_commands_in_the_deadband(world: str) -> None:
     # By hand: a fifth of the top speed is 0.039 m/s, three tenths 0.059.
     assert mean_speeds(world, (0.2, 0.0), command_deadband_m_s=0.05)[0] < 0.001
