@@ -38,6 +38,7 @@ WIDENS, NARROWS = 0.85, 0.6
 """Success from which on ranges widen, and below which they narrow."""
 STEP = 0.2
 """Of the strength, at each decision."""
+NO_DECISION = -1
 
 
 def wheel_factors(ratio: FloatArray) -> FloatArray:
@@ -77,7 +78,7 @@ class Draws:
         """Take the environments' keys from what their generators were seeded with, without drawing from these."""
         self.keys[:] = [_key(generator) for generator in generators]
         self.episodes[:] = 0
-        self.curriculum = Curriculum.begin(len(self.keys))
+        self.curriculum.restart()
 
     def draw(self, ids: IntArray) -> None:
         """Draw for the next episode of the given environments."""
@@ -136,7 +137,7 @@ class Draws:
             "keys": self.keys,
             "episodes": self.episodes,
             "curriculum": self.curriculum.state,
-            "is_sample": self.curriculum.is_sample,
+            "counts_for": self.curriculum.counts_for,
         }
 
     def info(self) -> dict[str, FloatArray]:
@@ -155,14 +156,27 @@ class Curriculum:
     """
 
     state: FloatArray
-    """Strength, and how many of the episodes that count began, ended and succeeded, shape ``(4,)``."""
-    is_sample: BoolArray
-    """Environments whose episode counts, shape ``(n,)``."""
+    """Strength, how many of the episodes that count for the next decision began, ended and succeeded, and the decisions
+    so far, shape ``(5,)``."""
+    counts_for: IntArray
+    """Decision for which each environment's episode counts, shape ``(n,)``; ``NO_DECISION`` for none."""
+    leads: bool = True
+    """It does not share the state of another one."""
 
     @classmethod
     def begin(cls, n: int) -> Curriculum:
         """With strength 0."""
-        return cls(np.zeros(4), np.zeros(n, dtype=bool))
+        return cls(np.zeros(5), np.full(n, NO_DECISION))
+
+    def follow(self, leader: Curriculum) -> None:
+        """Be one curriculum with that of other environments from now on."""
+        self.state, self.leads = leader.state, False
+
+    def restart(self) -> None:
+        """Back to strength 0; who follows leaves that to the one it follows."""
+        self.counts_for[:] = NO_DECISION
+        if self.leads:
+            self.state[:] = 0.0
 
     @property
     def strength(self) -> float:
@@ -177,17 +191,19 @@ class Curriculum:
             is_over: Which of the episodes ended by themselves; others are cut short, and another one takes their place.
             successes: Which of them arrived.
         """
-        counts, cut = self.is_sample[ids] & is_over, self.is_sample[ids] & ~is_over
-        self.is_sample[ids] = False
-        self.state[1:] += -cut.sum(), counts.sum(), successes[counts].sum()
-        _, _, ended, arrived = self.state
+        _, _, _, _, decision = self.state
+        is_sample = self.counts_for[ids] == decision
+        counts, cut = is_sample & is_over, is_sample & ~is_over
+        self.counts_for[ids] = NO_DECISION
+        self.state[1:4] += -cut.sum(), counts.sum(), successes[counts].sum()
+        _, _, ended, arrived, _ = self.state
         widens = arrived >= WIDENS * WINDOW
         narrows = ended - arrived > (1.0 - NARROWS) * WINDOW
         if widens or narrows or ended >= WINDOW:
             change = STEP if widens else -STEP if narrows else 0.0
             # Rounded, so that steps make 1.
-            self.state[:] = min(max(round(self.strength + change, 6), 0.0), 1.0), 0, 0, 0
-            self.is_sample[:] = False  # those under way were at the strength before
+            # Episodes under way were at the strength before: they count for a decision that has been made.
+            self.state[:] = min(max(round(self.strength + change, 6), 0.0), 1.0), 0, 0, 0, decision + 1
 
     def strength_for(self, ids: IntArray, keys: Keys, episodes: IntArray) -> FloatArray:
         """Strength of the next episode of each environment, shape ``(len(ids),)``."""
@@ -195,7 +211,7 @@ class Curriculum:
         _shares(keys, np.array([name_id("curriculum"), name_id("strength")], dtype=np.uint64), episodes, shares)
         is_present = shares[:, 0] < 0.5
         wanted = is_present & (self.state[1] + np.cumsum(is_present) <= WINDOW)
-        self.is_sample[ids] = wanted
+        self.counts_for[ids] = np.where(wanted, int(self.state[4]), NO_DECISION)
         self.state[1] += wanted.sum()
         return np.where(is_present, self.strength, self.strength * shares[:, 1])
 

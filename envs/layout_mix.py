@@ -50,6 +50,9 @@ class LayoutMix(VectorEnv[AnyArray, AnyArray, AnyArray]):
         self.groups = [make(draw(self._layout_rng), self._size) for _ in range(n_groups)]
         self._age = np.zeros(n_groups, dtype=np.int64)
         first = self.groups[0]
+        # One group's robots end too few episodes for a decision.
+        for group in self.groups[1:]:
+            group.follow_curriculum(first)
         self.single_observation_space, self.single_action_space = (
             first.single_observation_space,
             first.single_action_space,
@@ -87,10 +90,8 @@ class LayoutMix(VectorEnv[AnyArray, AnyArray, AnyArray]):
 
     @property
     def curriculum_strength(self) -> float | None:
-        """The mean over the groups; None without a curriculum."""
-        strengths = [group.curriculum_strength for group in self.groups]
-        known = [one for one in strengths if one is not None]
-        return float(np.mean(known)) if known else None
+        """See ``NavigationVectorEnv.curriculum_strength``; all groups have the same one."""
+        return self.groups[0].curriculum_strength
 
     def _new_layout(self) -> dict[str, Any]:
         return {"layout": self._draw(self._layout_rng)}

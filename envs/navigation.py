@@ -311,6 +311,9 @@ class NavigationVectorEnv(VectorEnv[AnyArray, AnyArray, AnyArray]):
         """How much of its ranges a curriculum draws from at present, in [0, 1]; None without one."""
         return None
 
+    def follow_curriculum(self, leader: NavigationVectorEnv) -> None:
+        """Share the curriculum of other environments, which reset first; nothing to do where there is none."""
+
     def start_and_goal(self, i: int) -> tuple[Cell, Cell]:
         """Start and goal cell of environment ``i``'s current episode."""
         (row, col), (goal_row, goal_col) = self._start[i].tolist(), self._goal[i].tolist()

@@ -7,6 +7,7 @@ is ``Draws``; who puts what was drawn into force are ``imperfections`` (commands
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from difflib import get_close_matches
@@ -32,6 +33,12 @@ class Range:
     """Highest value."""
     law: Law = "uniform"
     """``uniform``, or ``log``: the logarithm is uniform, for what may vary by factors."""
+
+    def at(self, share: float) -> float:
+        """The value that so large a share of all draws lies below."""
+        low, high = (math.log(end) if self.law == "log" else end for end in (self.low, self.high))
+        value = low + share * (high - low)
+        return math.exp(value) if self.law == "log" else value
 
     def scaled(self, strength: float, nominal: float) -> Range:
         """The range drawn together around the nominal value: 0 is that value alone, 1 the range as it is."""
@@ -223,6 +230,11 @@ class Randomization:
             n: [r.low, r.high] + ([r.law] if r.law != "uniform" else []) for n, r in ranges.items()
         }
         return values | ({"curriculum": True} if self.curriculum else {})
+
+    @classmethod
+    def inlined(cls, source: str) -> str:
+        """A preset's name as it is, anything else as JSON text: what needs no file to be loaded again."""
+        return source if source in PRESETS else json.dumps(cls.load(source).to_json())
 
     @classmethod
     def load(cls, source: str | Path | Mapping[str, Any] | Randomization) -> Randomization:

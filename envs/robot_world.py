@@ -91,6 +91,11 @@ class RobotVectorEnv(NavigationVectorEnv):
         """See ``NavigationVectorEnv.curriculum_strength``."""
         return self._draws.curriculum.strength if self.randomization.curriculum else None
 
+    def follow_curriculum(self, leader: NavigationVectorEnv) -> None:
+        """See ``NavigationVectorEnv.follow_curriculum``."""
+        assert isinstance(leader, RobotVectorEnv)
+        self._draws.curriculum.follow(leader._draws.curriculum)
+
     def _spaces(self) -> tuple[gym.Space[Any], gym.Space[Any]]:
         largest = replace(self.layout, cell_size_m=self.layout.cell_size_m * self.randomization.cell_size.high)
         return FeatureVector(largest, self.robot).space, Box(-1.0, 1.0, (2,), np.float32)
@@ -166,9 +171,9 @@ class RobotVectorEnv(NavigationVectorEnv):
         self._n_layouts += 1
         kept = [(int(fixed[end][0]), int(fixed[end][1])) for end in ("start", "goal") if end in fixed]
         rng = np.random.default_rng([int(draws.keys[0]), self._n_layouts])
-        # Walls: uniform over the whole numbers in the range. Size: uniform.
+        # Walls: uniform over the whole numbers in the range. Size: by its law.
         n_walls = int(rng.integers(round(varied.obstacles_moved.low), round(varied.obstacles_moved.high) + 1))
-        draws["cell_size"][:] = size = rng.uniform(varied.cell_size.low, varied.cell_size.high)
+        draws["cell_size"][:] = size = varied.cell_size.at(rng.uniform())
         moved = layout.with_moved_walls(n_walls, rng, kept=kept)
         draws["obstacles_moved"][:] = (moved.walls & ~layout.walls).sum()
         return replace(moved, cell_size_m=layout.cell_size_m * size)

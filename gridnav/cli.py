@@ -33,7 +33,7 @@ from rich.table import Table
 from gridnav.agents import OnProgress
 from gridnav.agents import Progress as Learning
 from gridnav.display.viewer import ViewerError
-from gridnav.envs import RANDOMIZATION_PRESETS, RenderingError
+from gridnav.envs import Randomization, RenderingError
 from gridnav.experiment.checkpoint import clear_leftovers
 from gridnav.experiment.course import CHECKPOINT_S
 from gridnav.experiment.run_directory import CONFIG, RESULT, RunDirectory, read_json, write_json
@@ -103,9 +103,7 @@ class _Run:
             raise InputError(f"--checkpoint-s {self.checkpoint_s} is outside 0 to 86400 seconds")
         problem = Problem.load(self.layout, self.task, self.reward, self.randomization)
         layout = self.layout if self.layout in (*NAMED_LAYOUTS, RANDOM) else problem.layout.to_text()
-        varied = self.randomization
-        if varied not in RANDOMIZATION_PRESETS:
-            varied = json.dumps(problem.randomization.to_json())
+        varied = Randomization.inlined(self.randomization)
         config = asdict(replace(self, layout=layout, randomization=varied, **OF_ONE_START))
         config = {key: value for key, value in config.items() if key not in OF_ONE_START and value is not None}
         if varied == "none":
@@ -254,7 +252,8 @@ class Sweep:
     quantities: tuple[str, ...] = ()
     """Of the randomization, for leave-one-out, one-at-a-time and strength; or drive, physics, command, sense."""
     randomizations: tuple[str, ...] = ()
-    """What the study presets compares, such as none wide mine.json; all presets by default."""
+    """What the study presets compares, such as none wide mine.json slow='{"command_delay_s": [0.1, 0.3]}'; all presets
+    by default."""
     grid: tuple[str, ...] = ()
     """Fields with the values to combine, such as seed=0,1,2 set.learning_rate=0.001,0.003 layout=classic,u-trap."""
     random: tuple[str, ...] = ()
@@ -348,7 +347,8 @@ class Sweep:
             finished = _parse(_Finished, f"sweep --study {self.study}", list(self.common))
             if not 1 <= finished.episodes <= 100_000:
                 raise InputError(f"--episodes {finished.episodes} is outside 1 to 100000")
-            shared = json.loads(json.dumps(asdict(finished)))
+            varied = Randomization.inlined(finished.randomization) if finished.randomization else ""
+            shared = json.loads(json.dumps(asdict(replace(finished, randomization=varied))))
             wish = Wish((), finished.randomization, self.quantities, runs=self.runs, episodes=finished.episodes)
         else:
             self._leave_out("runs", because="is for the studies one-at-a-time and strength")
@@ -356,8 +356,7 @@ class Sweep:
             seeds = (10 if shared["budget"] == "full" else 3) if self.seeds is None else self.seeds
             if not 1 <= seeds <= 1000:
                 raise InputError(f"--seeds {seeds} is outside 1 to 1000")
-            if self.study == "presets" and "randomization" in shared:
-                raise InputError("--randomization is one for all: leave it out, or name several as --randomizations")
+            self._refuse_what_the_study_decides(shared)
             arms = shared.get("arms") or ""
             wish = Wish(range(seeds), shared.get("randomization", ""), self.quantities, self.randomizations, arms)
         trials = []
@@ -370,6 +369,16 @@ class Sweep:
                 config = _checked(draft.command, {**own, **draft.fields, **({"set": changes} if changes else {})})
             trials.append(Trial(number, draft.settings, config, draft.under))
         return trials, self._config(shared)
+
+    def _refuse_what_the_study_decides(self, shared: Mapping[str, Any]) -> None:
+        if shared["seed"] != 0:
+            raise InputError(f"--seed {shared['seed']}: a study takes the seeds 0, 1, ...; say how many with --seeds")
+        if shared.get("agent", "ppo") not in ("ppo", Train.agent):
+            raise InputError(f"--agent {shared['agent']}: the study trains ppo, leave it out")
+        if self.study == "presets" and "randomization" in shared:
+            raise InputError("--randomization is one for all: leave it out, or name several as --randomizations")
+        if self.study == "leave-one-out" and "--randomization" in self.common and "randomization" not in shared:
+            raise InputError("--randomization none: nothing varies there, so nothing can be left out")
 
     def _shared(self, command: str) -> dict[str, Any]:
         """What all trials of a command have in common, as its configuration."""
@@ -385,9 +394,10 @@ class Sweep:
         if self.runs:
             own["runs"] = [str(path.resolve()) for path in self.runs]
         if self.randomizations:
-            own["randomizations"] = [
-                one if one in RANDOMIZATION_PRESETS else str(Path(one).resolve()) for one in self.randomizations
-            ]
+            from gridnav.experiment.sweeps.studies import compared
+
+            named = compared(self.randomizations)
+            own["randomizations"] = [name if name == what else f"{name}={what}" for name, what in named.items()]
         return json.loads(json.dumps({"command": "sweep", **shared, **own}))
 
     def _leave_out(self, *names: str, because: str) -> None:
@@ -438,7 +448,7 @@ class Evaluate:
     def __call__(self) -> int:
         """Run it."""
         from gridnav.experiment.across_seeds import across_seeds, compared_curves
-        from gridnav.experiment.results import evaluate_again, evaluation
+        from gridnav.experiment.results import evaluate_again, evaluation, stored_evaluation
 
         if not self.runs:
             raise InputError("evaluate needs the folder of at least one run")
@@ -464,6 +474,8 @@ class Evaluate:
                 "--keep has nothing to keep: no episode of the test reality is shown; name another one too"
             )
         runs = [RunDirectory.open(path) for path in self.runs]
+        for run in runs:
+            stored_evaluation(run)  # says that it is not whole before minutes are spent on the others
         if self.reality:
             return self._measure_gaps(runs)
         with _progress() as on_stage:
@@ -472,14 +484,15 @@ class Evaluate:
                 for run in runs
             ]
         together = across_seeds(results) if len(runs) > 1 else []
+        curves = None if self.figure is None else compared_curves(results)
         if self.output is not None:
             own = {str(run.path): evaluation(one) for run, one in results}
             content: dict[str, Any] = {"results": next(iter(own.values()))} if len(own) == 1 else {"runs": own}
             write_json(self.output, content | ({"across_seeds": [asdict(row) for row in together]} if together else {}))
-        if self.figure is not None:
+        if self.figure is not None and curves is not None:
             from gridnav.display.figures import save_figure  # matplotlib takes a second to import
 
-            save_figure(compared_curves(results), self.figure)
+            save_figure(curves, self.figure)
         for run, one in results:
             _show(one, None, title=str(run.path) if len(runs) > 1 else "")
         if together:
@@ -961,6 +974,8 @@ def _help() -> None:
 
 
 def _check_folder(flag: str, file: Path) -> None:
+    if file.is_dir() or not file.name:
+        raise InputError(f"{flag} {str(file)!r} is a folder: name a file")
     if not file.parent.is_dir():
         raise InputError(f"{flag} {str(file)!r}: there is no folder {str(file.parent)!r}")
 

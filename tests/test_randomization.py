@@ -214,10 +214,10 @@ def play_window(draws: Draws, success: float) -> None:
     ids = np.arange(len(draws.keys))
     draws.draw(ids)
     for _ in range(100):
-        before = draws.curriculum.state.copy()
-        counted = draws.curriculum.is_sample.cumsum() + before[2]
+        _, _, ended, _, decisions = draws.curriculum.state
+        counted = (draws.curriculum.counts_for == decisions).cumsum() + ended
         draws.curriculum.note(ids, np.ones(len(ids), dtype=bool), counted <= success * WINDOW)
-        if draws.curriculum.state[2] < before[2] or not draws.curriculum.state[1:].any():
+        if draws.curriculum.state[4] > decisions:
             return
         draws.draw(ids)
     pytest.fail("the curriculum never decided")
@@ -238,20 +238,20 @@ def test_the_curriculum_waits_for_the_slow_episodes_and_does_not_count_what_was_
     """The first to end are the good ones: would they decide, ranges would widen where one robot in three is lost."""
     curriculum = Curriculum.begin(2 * WINDOW)
     everyone, over = np.arange(2 * WINDOW), np.ones(WINDOW, dtype=bool)
-    curriculum.state[1], curriculum.is_sample[:WINDOW] = WINDOW, True
+    curriculum.state[1], curriculum.counts_for[:WINDOW] = WINDOW, 0
     fast, slow = everyone[: WINDOW * 2 // 3], everyone[WINDOW * 2 // 3 : WINDOW]
 
     curriculum.note(fast, over[: len(fast)], over[: len(fast)])
-    assert curriculum.state.tolist() == [0.0, WINDOW, len(fast), len(fast)]
+    assert curriculum.state.tolist() == [0.0, WINDOW, len(fast), len(fast), 0]
     curriculum.note(slow[:10], ~over[:10], over[:10])  # the robots are put into another maze
-    assert curriculum.state.tolist() == [0.0, WINDOW - 10, len(fast), len(fast)]
+    assert curriculum.state.tolist() == [0.0, WINDOW - 10, len(fast), len(fast), 0]
     keys = np.arange(1000, dtype=np.uint64)[everyone]
     curriculum.strength_for(everyone[WINDOW:], keys[WINDOW:], np.ones(WINDOW, dtype=np.int64))
-    assert curriculum.is_sample[WINDOW:].sum() == 10  # as many take their place, and no more
+    assert (curriculum.counts_for[WINDOW:] == 0).sum() == 10  # as many take their place, and no more
     curriculum.note(slow[10:], over[: len(slow) - 10], ~over[: len(slow) - 10])
     curriculum.note(everyone[WINDOW:], over, ~over)
 
-    assert curriculum.state.tolist() == [0.0, 0, 0, 0]  # two of three arrived: neither wider nor narrower
+    assert curriculum.state.tolist() == [0.0, 0, 0, 0, 1]  # two of three arrived: neither wider nor narrower
 
 
 @pytest.mark.parametrize(("arrives", "settled", "change"), [(True, 102, STEP), (False, 49, -STEP)])
@@ -261,14 +261,15 @@ def test_the_curriculum_decides_once_the_episodes_under_way_cannot_change_it(
     """By hand: 102 arrivals are 85 % of 120 whatever the others do, 49 failures leave less than 60 %."""
     curriculum = Curriculum.begin(WINDOW)
     everyone, alike = np.arange(WINDOW), np.ones(WINDOW, dtype=bool)
-    curriculum.state[:2], curriculum.is_sample[:] = (0.5, WINDOW), True
+    curriculum.state[:2], curriculum.counts_for[:] = (0.5, WINDOW), 0
 
     curriculum.note(everyone[: settled - 1], alike[: settled - 1], alike[: settled - 1] & arrives)
     assert curriculum.strength == 0.5
     curriculum.note(everyone[settled - 1 : settled], alike[:1], alike[:1] & arrives)
 
-    assert curriculum.state.tolist() == [0.5 + change, 0, 0, 0]
-    assert not curriculum.is_sample.any()  # what is under way says nothing of the new strength
+    assert curriculum.state.tolist() == [0.5 + change, 0, 0, 0, 1]
+    curriculum.note(everyone[settled:], alike[settled:], alike[settled:])
+    assert curriculum.state[2] == 0  # what was under way says nothing of the new strength
 
 
 def test_the_curriculum_begins_with_the_nominal_robot_and_stays_within_its_ranges() -> None:
@@ -293,13 +294,35 @@ def test_the_curriculum_begins_with_the_nominal_robot_and_stays_within_its_range
 def test_an_environment_tells_its_curriculum_which_episodes_arrived(world: str) -> None:
     env = make(world, "curriculum", 8, max_episode_steps=4)
     env.reset(seed=0)
-    sampled = env._draws.curriculum.is_sample.sum()
+    sampled = (env._draws.curriculum.counts_for == 0).sum()
     for actions in bold_actions(4, 8):
         env.step(actions)
 
-    began, ended, arrived = env._draws.curriculum.state[1:]
+    began, ended, arrived = env._draws.curriculum.state[1:4]
     assert (ended, arrived) == (sampled, 0)
-    assert began == ended + env._draws.curriculum.is_sample.sum()
+    assert began == ended + (env._draws.curriculum.counts_for == 0).sum()
+
+
+def test_groups_in_mazes_of_their_own_share_a_curriculum_that_begins_anew_with_a_seed() -> None:
+    def worlds(layout: Layout, n: int) -> NavigationVectorEnv:
+        env = make("Unicycle", "curriculum", n, layout=layout, max_episode_steps=3)
+        assert isinstance(env, NavigationVectorEnv)
+        return env
+
+    mix = LayoutMix(worlds, 40, lambda rng: Layout.load("open"), n_groups=20, renew_steps=100)
+    mix.reset(seed=0)
+    for _ in range(40):
+        mix.step(np.zeros((40, 2)))
+    first = mix.groups[0]._draws.curriculum  # type: ignore[attr-defined]
+
+    # By hand: nobody moves, all fail, and every three steps about 20 count; of a group alone it would be 13 in all.
+    assert first.state[4] >= 2
+    assert mix.curriculum_strength == 0.0
+    first.state[0] = 0.4
+    assert {group.curriculum_strength for group in mix.groups} == {0.4}
+    mix.reset(seed=1)
+    assert mix.curriculum_strength == 0.0
+    assert first.state[1] > 0
 
 
 # ---- Scalar and vector, states -------------------------------------------------------------------

@@ -59,6 +59,51 @@ def test_the_conclusion_says_so_instead_of_a_number_that_is_none() -> None:
     assert conclusion(gaps).endswith("all 2 policies do equally well at one of the places, so nothing correlates.")
 
 
+def test_what_was_kept_has_an_interval_where_everything_arrived() -> None:
+    share, low, high = Gap("one", summary(1.0), {"mars": summary(1.0)}).retention("mars")
+
+    # By hand: after 200 of 200, Jeffreys' posterior of the success lies above 0.9876 with 97.5 %.
+    assert share == 1.0
+    assert 0.97 < low < 0.99 < 1.0 < high < 1.03
+
+
+def test_nobody_looks_at_the_sealed_reality_before_all_runs_are_known_to_be_whole(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole, half = plan_run(tmp_path / "whole"), plan_run(tmp_path / "half")
+    (half / "evaluation.json").unlink()
+
+    assert run_cli("evaluate", str(whole), str(half), "--reality", "test", "--episodes", "2") == 2
+
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    assert not (whole / SEALED_LOG).exists()
+
+
+def test_two_runs_of_one_name_would_be_one_policy_and_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "other").mkdir()
+    runs = [str(plan_run(folder / "plan")) for folder in (tmp_path, tmp_path / "other")]
+
+    assert run_cli("evaluate", *runs, "--reality", "structural", "--episodes", "2") == 2
+
+    assert "two of the runs are called 'plan'" in capsys.readouterr().err
+
+
+def test_evaluate_writes_nothing_where_one_of_its_files_is_not_possible(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = ("evaluate", str(plan_run(tmp_path / "plan")), "--episodes", "2")
+    out, figure = tmp_path / "out.json", tmp_path / "curves.png"
+
+    assert run_cli(*asked, "--output", str(out), "--figure", str(figure)) == 2  # a plan has no curve
+    assert run_cli(*asked, "--output", str(tmp_path)) == 2
+    assert run_cli(*asked, "--output", ".") == 2
+
+    assert len(capsys.readouterr().err.strip().splitlines()) >= 3
+    assert [path.name for path in tmp_path.iterdir()] == ["plan"]
+
+
 def test_evaluate_reality_measures_reports_keeps_and_counts(tmp_path: Path) -> None:
     run, page, kept = plan_run(tmp_path / "plan"), tmp_path / "gap.html", tmp_path / "kept"
     asked = ("evaluate", str(run), "--reality", "structural", "test", "--episodes", "4")

@@ -11,8 +11,10 @@ from command_line import run_cli
 from matplotlib import pyplot as plt
 
 from gridnav.agents import PPO_PRESETS
+from gridnav.cli import Sweep
 from gridnav.display.responses import Panel, Response, responses
 from gridnav.envs import PARAMETERS, RANDOMIZATION_PRESETS, Randomization
+from gridnav.experiment.across_seeds import labels_of
 from gridnav.experiment.run_directory import RunDirectory, write_json
 from gridnav.experiment.sim_to_real import MEASURED
 from gridnav.experiment.sweeps.findings import write_study
@@ -54,19 +56,32 @@ def test_presets_has_short_trainings_so_that_policies_differ_in_quality() -> Non
         (change,) = one.fields["set"]
         assert change.startswith("steps=")
         assert 10 * int(change.removeprefix("steps=")) == PPO_PRESETS[preset].steps
-        assert one.settings["training"] == "1/10"
+        assert one.settings["training"] == "short"
 
 
 def test_presets_compares_those_that_were_named_and_files_by_their_names() -> None:
     Path("slow.json").write_text('{"command_delay_s": [0.1, 0.2]}')
 
-    drafts = plan("presets", Wish(seeds=(0,), randomizations=("none", "slow.json")))
+    drafts = plan("presets", Wish(seeds=(0,), randomizations=("none", "slow.json", 'heavy={"mass": 1.2}')))
 
     # By hand: each whole, and `none` for a tenth of its steps as well.
     assert [(one.settings["randomization"], one.settings["training"]) for one in drafts] == [
-        ("none", "whole"), ("slow", "whole"), ("none", "1/10"),
+        ("none", "whole"), ("slow", "whole"), ("heavy", "whole"), ("none", "short"),
     ]  # fmt: skip
+    Path("slow.json").unlink()  # a trial needs no file
     assert Randomization.load(drafts[1].fields["randomization"]).names == ("command_delay_s",)
+    assert Randomization.load(drafts[2].fields["randomization"]) == Randomization.fixed(mass=1.2)
+
+
+def test_the_config_of_a_study_needs_no_file_either(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("slow.json").write_text('{"command_delay_s": [0.1, 0.2]}')
+    words = ["--study", "presets", "--seeds", "1", "--randomizations", "slow.json", "--set", "steps=0"]
+
+    config = Sweep(study="presets", seeds=1, randomizations=("slow.json",))._study()[1]
+
+    assert config["randomizations"] == ['slow={"command_delay_s": [0.1, 0.2]}']
+    assert run_cli("sweep", *words) == 2  # no such training, so nothing was written
+    assert [path.name for path in Path.cwd().iterdir()] == ["slow.json"]
 
 
 def test_leave_one_out_leaves_out_one_group_at_a_time() -> None:
@@ -134,10 +149,13 @@ def test_the_default_study_is_arms_and_presets() -> None:
         ("leave-one-out", Wish(quantities=["wheel_radios"]), "wheel_radius"),
         ("leave-one-out", Wish(quantities=["command"], randomization="force-only"), "command"),
         ("leave-one-out", Wish(randomization="burgr"), "burgr"),
+        ("leave-one-out", Wish(randomization='{"cell_size": [0.8, 1.2]}'), "nothing can be left out"),
+        ("strength", Wish(runs=[Path("run")], randomization='{"cell_size": [0.8, 1.2]}'), "cell_size"),
         ("presets", Wish(randomizations=["none", "burgr"]), "burgr"),
         ("presets", Wish(randomizations=["none", "none"]), "none"),
         ("presets", Wish(randomizations=["none", "wide.json"]), "rename"),
-        ("presets", Wish(randomizations=['{"mass": 1.1}']), "file"),
+        ("presets", Wish(randomizations=['{"mass": 1.1}']), "NAME="),
+        ("presets", Wish(randomizations=['wide={"mass": 1.1}']), "rename"),
         ("presets", Wish(randomizations=["missing.json"]), "missing.json"),
     ],
 )
@@ -163,6 +181,9 @@ def test_what_no_study_can_do_is_refused(study: str, wish: Wish, named: str) -> 
         (["--study", "strength", "--runs", "a", "--episodes", "0"], "--episodes 0"),
         (["--seeds", "3", "--grid", "seed=0,1"], "--seeds"),
         (["--study", "presets", "--randomization", "wide"], "--randomizations"),
+        (["--study", "presets", "--seed", "5"], "--seeds"),
+        (["--study", "leave-one-out", "--agent", "dqn"], "--agent dqn"),
+        (["--study", "leave-one-out", "--randomization", "none"], "nothing can be left out"),
         (["--study", "arms", "--randomizations", "wide"], "--randomizations"),
         (["--study", "presets", "--randomizations", "none", "burgr"], "burgr"),
     ],
@@ -175,6 +196,16 @@ def test_bad_flags_get_one_line_and_nothing_is_written(
     (line,) = capsys.readouterr().err.splitlines()
     assert named in line
     assert list(Path.cwd().iterdir()) == []
+
+
+def test_trainings_whose_words_are_cut_alike_are_not_seeds_of_one() -> None:
+    delay = '{"lidar_delay_s": [0.0, 0.2]'
+    mass, friction = delay + ', "mass": [1, 2]}', delay + ', "wheel_friction": [0.5, 1]}'
+    configs = [{"seed": seed, "randomization": one} for one in (mass, friction) for seed in (0, 1)]
+
+    labels = labels_of(configs)
+
+    assert labels[0] == labels[1] != labels[2] == labels[3]
 
 
 # ---- Findings --------------------------------------------------------------------------------------

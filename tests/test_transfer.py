@@ -72,8 +72,14 @@ def test_an_arm_is_measured_against_scratch() -> None:
     assert saved.negative == ()
 
 
+def test_one_seed_says_nothing_of_negative_transfer() -> None:
+    """It has no interval that could lie on the wrong side."""
+    assert transfer([learnt(SLOW)], [learnt(QUICK)] * 2, 100).negative == ()
+    assert transfer([learnt(SLOW)] * 2, [learnt(QUICK)], 100).negative == ()
+
+
 def test_negative_transfer_is_named() -> None:
-    harmed = transfer([learnt(SLOW)], [learnt(QUICK)], 100)
+    harmed = transfer([learnt(SLOW)] * 2, [learnt(QUICK)] * 2, 100)
 
     assert harmed.negative == ("an asymptote 12 points lower", "10.0 times the steps", "an area 49 % smaller")
 

@@ -19,7 +19,8 @@ from gridnav.problem.types import FloatArray, InputError
 
 SOLVED = 0.99
 """Success from which on a seed counts as solved."""
-OWN_TO_A_SEED = ("seed", "command")
+OWN_TO_A_SEED = ("seed", "command", "agent")
+"""What labels leave out: the agent has a name of its own in front of them."""
 
 
 @dataclass(frozen=True)
@@ -101,8 +102,16 @@ def labels_of(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     """What tells the configurations of runs from each other, in words, whatever their seeds; empty where nothing."""
     own = [{key: value for key, value in config.items() if key not in OWN_TO_A_SEED} for config in configs]
     keys = dict.fromkeys(key for config in own for key in config)
-    differ = [key for key in keys if len({json.dumps(config.get(key)) for config in own}) > 1 and key != "agent"]
-    return [" ".join(_words(config.get(key)) for key in differ if config.get(key)) for config in own]
+    differ = [key for key in keys if len({json.dumps(config.get(key)) for config in own}) > 1]
+    labels, known = [], dict[str, list[Any]]()
+    for config in own:
+        words = " ".join(_words(config.get(key)) for key in differ if config.get(key))
+        alike = known.setdefault(words, [])
+        if config not in alike:
+            alike.append(config)
+        number = alike.index(config) + 1  # words are cut short, and what is cut off may differ
+        labels.append(words if number == 1 else f"{words} ({number})")
+    return labels
 
 
 def _words(value: Any) -> str:

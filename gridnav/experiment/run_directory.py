@@ -258,6 +258,18 @@ def _free_path(name: str) -> Path:
     return path
 
 
+def check_names(runs: Sequence[RunDirectory]) -> None:
+    """Whether the names of their folders tell some runs apart.
+
+    Raises:
+        InputError: When two have the same one.
+    """
+    names = [run.path.resolve().name for run in runs]
+    if len(set(names)) < len(names):
+        twice = max(names, key=names.count)
+        raise InputError(f"two of the runs are called {twice!r}: the table could not tell them apart, rename a folder")
+
+
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write a file that is either whole or not there."""
     write_whole(path, json.dumps(content, indent=2, allow_nan=False) + "\n")

@@ -21,7 +21,7 @@ from gridnav.experiment.checkpoint import load_agent
 from gridnav.experiment.evaluation import evaluate_in
 from gridnav.experiment.reality import WORLD, Reality, find_reality
 from gridnav.experiment.results import stored_evaluation, write_evaluation, write_rollouts
-from gridnav.experiment.run_directory import RunDirectory, read_json, write_json
+from gridnav.experiment.run_directory import RunDirectory, check_names, read_json, write_json
 from gridnav.experiment.training import OnStage, Result, unseen
 from gridnav.experiment.workers import in_workers
 from gridnav.experiment.worlds import Problem
@@ -44,8 +44,8 @@ QUESTION = "What do policies keep of their success in worlds that training never
 COLUMNS = ("policy", "world", "success", "kept", "SPL", "collided")
 LEGEND = (
     "Home is the world of the policy's training, with what was randomised there. Kept: success in the reality over "
-    "success at home. In parentheses 95 % intervals: Wilson's, and of what was kept by parametric bootstrap. Collided: "
-    "share of the episodes with a contact. The same starts, goals and headings everywhere."
+    "success at home. In parentheses 95 % intervals: Wilson's, and of what was kept from Jeffreys' posteriors. "
+    "Collided: share of the episodes with a contact. The same starts, goals and headings everywhere."
 )
 
 
@@ -66,9 +66,12 @@ class Gap:
         if home.success_rate == 0.0:
             return float("nan"), float("nan"), float("nan")
         rng = np.random.default_rng(0)
-        # Successes: binomial around what was seen, at home and away.
-        draws = [rng.binomial(one.episodes, one.success_rate, DRAWS) / one.episodes for one in (there, home)]
-        low, high = np.quantile(draws[0] / np.maximum(draws[1], 0.5 / home.episodes), [0.025, 0.975])
+        # True success, at home and away: Jeffreys' posterior, which has a width where all or nothing arrived.
+        draws = []
+        for one in (there, home):
+            arrived = one.success_rate * one.episodes
+            draws.append(rng.beta(arrived + 0.5, one.episodes - arrived + 0.5, DRAWS))
+        low, high = np.quantile(draws[0] / draws[1], [0.025, 0.975])
         return there.success_rate / home.success_rate, float(low), float(high)
 
 
@@ -106,12 +109,14 @@ def measure(
         on_episodes: Given the episodes in each reality that is not sealed, with the problem they are of.
 
     Raises:
-        InputError: When a reality is unknown, or a run is not whole.
+        InputError: When a reality is unknown, a run is not whole, or two have one name.
     """
     worlds = [find_reality(name) for name in realities]
+    if len(runs) > 1:
+        check_names(runs)
     gaps = []
-    for run in runs:
-        problem, rows = stored_evaluation(run)
+    # All are read before one is measured: a look at the sealed reality that nobody is told of would be lost.
+    for run, (problem, rows) in [(run, stored_evaluation(run)) for run in runs]:
         for name, row in rows.items():
             if row["world"] == "GridWorld":
                 continue

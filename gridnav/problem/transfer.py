@@ -162,7 +162,8 @@ def transfer(arm: Sequence[Learnt], scratch: Sequence[Learnt], horizon: float) -
         asymptote=own(lambda one: asymptote(one.curve, horizon)),
         gain=gain,
         ratio=ratio,
-        negative=tuple(_worse(gain, steps_ratio, ratio)),
+        # One seed has no interval to lie on the wrong side.
+        negative=tuple(_worse(gain, steps_ratio, ratio)) if min(len(arm), len(scratch)) > 1 else (),
     )
 
 

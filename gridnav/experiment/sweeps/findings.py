@@ -233,15 +233,19 @@ def _find_one_at_a_time(done: Sequence[Done], sweep: RunDirectory, measured: Mea
 
 def _find_strength(done: Sequence[Done], sweep: RunDirectory, measured: Measured) -> Findings:
     lines = {label: line for (label, _), line in _lines(done, "", "strength").items()}
-    area = {label: float(np.trapezoid(line.y, line.x) / (line.x[-1] - line.x[0])) for label, line in lines.items()}
+    area = {
+        label: float(np.trapezoid(line.y, line.x) / (line.x[-1] - line.x[0])) if len(line.x) > 1 else line.y[0]
+        for label, line in lines.items()
+    }
     best = max(area, key=lambda label: area[label])
-    at = {label: [line.y[line.x.index(k)] for k in (0.0, 1.0, 2.0)] for label, line in lines.items()}
-    told = [f"{label} {', '.join(map(percent, at[label]))}" for label in lines]
+    found = {label: dict(zip(line.x, line.y, strict=True)) for label, line in lines.items()}
+    at = {label: [percent(y[k]) if k in y else "-" for k in (0.0, 1.0, 2.0)] for label, y in found.items()}
+    told = [f"{label} {', '.join(at[label])}" for label in lines]
     sentence = (
         f"Success at strength 0, 1 and 2: {'; '.join(told)}. On average over strengths {best} reaches "
         f"{percent(area[best])}."
     )
-    rows = [[label, *map(percent, at[label]), percent(area[label])] for label in lines]
+    rows = [[label, *at[label], percent(area[label])] for label in lines]
     columns = ("agent", "strength 0", "strength 1", "strength 2", "mean over strengths")
     table = Table("Robustness", columns, rows, "The mean is the area under the curve over its width. " + OVER_SEEDS)
     figure = responses([Panel("strength of the randomization (1: as given, 0: nothing varies)", lines)])

@@ -11,7 +11,7 @@ from typing import Any
 
 from gridnav.envs import PARAMETERS, RANDOMIZATION_PRESETS, Randomization
 from gridnav.experiment.arms import ARMS
-from gridnav.experiment.run_directory import RunDirectory
+from gridnav.experiment.run_directory import RunDirectory, check_names
 from gridnav.experiment.sweeps.design import Settings
 from gridnav.experiment.transfer import SCRATCH
 from gridnav.problem.types import InputError
@@ -22,10 +22,10 @@ UNDER = {"none": "none", "burger": "burger", "wide": "wide"}
 """Where agents of the presets are evaluated."""
 WHOLE = "whole"
 """A training of its preset's length."""
-TENTH = "1/10"
-"""A training of a tenth of those steps: a correlation needs policies that differ in quality."""
+SHORTENED = "short"
+"""A training of ``SHORT`` steps: a correlation needs policies that differ in quality."""
 SHORT = {"none": 48_000, "wide": 96_000}
-"""Steps of such a training, by the randomization it trains under."""
+"""Steps by the randomization of the training: a tenth of what `classic` takes."""
 STRENGTHS = tuple(k / 4 for k in range(9))
 REACHES = (0.5, 1.0, 1.5, 2.0)
 """How far a quantity goes from its nominal value, as a share of the way to either end of its range."""
@@ -84,28 +84,39 @@ def _plan_arms(wish: Wish) -> list[Draft]:
 
 
 def _plan_presets(wish: Wish) -> list[Draft]:
-    compared = _compared(wish.randomizations or tuple(RANDOMIZATION_PRESETS))
+    ranges = compared(wish.randomizations or tuple(RANDOMIZATION_PRESETS))
     drafts = []
-    for training, steps in ((WHOLE, dict.fromkeys(compared)), (TENTH, SHORT)):
-        for name in [one for one in compared if one in steps]:
+    for training, steps in ((WHOLE, dict.fromkeys(ranges)), (SHORTENED, SHORT)):
+        for name in [one for one in ranges if one in steps]:
             changes = () if steps[name] is None else (f"steps={steps[name]}",)
             for seed in wish.seeds:
                 settings = {"randomization": name, "training": training, "seed": str(seed)}
-                drafts.append(_training(settings, compared[name], seed, UNDER, changes))
+                drafts.append(_training(settings, ranges[name], seed, UNDER, changes))
     return drafts
 
 
-def _compared(sources: Sequence[str]) -> dict[str, str]:
-    """Randomizations by the name that the table has for them: a preset's, or a file's without its ending."""
+def compared(sources: Sequence[str]) -> dict[str, str]:
+    """Randomizations by their names in the table, each a preset or JSON text, which needs no file.
+
+    Args:
+        sources: Presets, JSON files, which are called as the file is without its ending, and ``NAME={JSON}``.
+
+    Raises:
+        InputError: When one is not possible, or two have one name.
+    """
     named: dict[str, str] = {}
     for source in sources:
-        if source.lstrip().startswith("{"):
-            raise InputError(f"--randomizations {source:.40} must be a preset or a JSON file: the table needs a name")
-        Randomization.load(source)  # says what is wrong before anything is trained
-        name = source if source in RANDOMIZATION_PRESETS else Path(source).stem
-        if name in named or (source != name and name in RANDOMIZATION_PRESETS):
-            raise InputError(f"--randomizations {source:.60}: another one is called {name!r:.60}, rename the file")
-        named[name] = source
+        name, equals, text = source.partition("=")
+        if source in RANDOMIZATION_PRESETS:
+            name = text = source
+        elif not (equals and text.lstrip().startswith("{")):
+            name, text = Path(source).stem, source
+        if source.lstrip().startswith("{") or not name:
+            raise InputError(f"--randomizations {source:.40} has no name for the table: write NAME={{...}}")
+        text = Randomization.inlined(text)
+        if name in named or (text != name and name in RANDOMIZATION_PRESETS):
+            raise InputError(f"--randomizations {source:.60}: another one is called {name!r:.60}, rename it")
+        named[name] = text
     return named
 
 
@@ -121,8 +132,9 @@ def _plan_leave_one_out(wish: Wish) -> list[Draft]:
     parts = {name: GROUPS.get(name, (name,)) for name in wish.quantities or GROUPS}
     left = {NOTHING: whole} | {name: whole.without(*quantities) for name, quantities in parts.items()}
     idle = [name for name, rest in left.items() if name != NOTHING and rest == whole]
-    if idle and wish.quantities:
-        raise InputError(f"--quantities {idle[0]}: the randomization leaves that as it is, so nothing can be left out")
+    if idle and (wish.quantities or len(idle) == len(parts)):
+        what = f"--quantities {idle[0]}" if wish.quantities else f"--randomization {wish.randomization:.60}"
+        raise InputError(f"{what}: the randomization leaves that as it is, so nothing can be left out")
     left = {name: rest for name, rest in left.items() if name not in idle} | {EVERYTHING: Randomization()}
     under = {"whole": _text(whole), "none": "none"}
     return [
@@ -139,8 +151,7 @@ def _plan_one_at_a_time(wish: Wish) -> list[Draft]:
     drafts = []
     for run in _runs(wish):
         ranges = Randomization.load(_varied(wish, run))
-        names = [name for name in ranges.names if PARAMETERS[name].acts_on != "layout"]
-        for name in _chosen(wish.quantities, names):
+        for name in _chosen(wish.quantities, ranges):
             for value in _values(ranges, name):
                 settings = {"run": run.path.name, "quantity": name, "value": value}
                 drafts.append(_evaluation(settings, Randomization.fixed(**{name: float(value)}), run, wish))
@@ -157,28 +168,25 @@ def _values(ranges: Randomization, name: str) -> list[str]:
 
 def _plan_strength(wish: Wish) -> list[Draft]:
     return [
-        _evaluation({"run": run.path.name, "strength": f"{strength:g}"}, ranges.scaled(strength), run, wish)
+        _evaluation({"run": run.path.name, "strength": f"{strength:g}"}, part.scaled(strength), run, wish)
         for run in _runs(wish)
-        for ranges in [_part(Randomization.load(_varied(wish, run)), wish.quantities)]
+        for ranges in [Randomization.load(_varied(wish, run))]
+        for part in [ranges.only(*_chosen(wish.quantities, ranges))]
         for strength in STRENGTHS
     ]
 
 
-def _part(ranges: Randomization, quantities: Sequence[str]) -> Randomization:
-    return ranges.only(*_chosen(quantities, ranges.names)) if quantities else ranges
-
-
-def _chosen(quantities: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Those of the names that were asked for, alone or in groups."""
+def _chosen(quantities: Sequence[str], ranges: Randomization) -> list[str]:
+    """Those that vary of the quantities that were asked for, alone or in groups; mazes stay in evaluations."""
     wanted = [one for name in quantities for one in GROUPS.get(name, (name,))]
     unknown = [name for name in wanted if name not in PARAMETERS]
     if unknown:
         Randomization().without(*unknown)  # says what was meant
+    names = [name for name in ranges.names if PARAMETERS[name].acts_on != "layout"]
     chosen = [name for name in names if not wanted or name in wanted]
     if not chosen:
-        raise InputError(
-            f"nothing of {', '.join(quantities):.60} varies in that randomization: {', '.join(names):.100}"
-        )
+        what = ", ".join(quantities) or "robots, commands and senses"
+        raise InputError(f"nothing of {what:.60} varies in that randomization: {', '.join(ranges.names):.100}")
     return chosen
 
 
@@ -189,11 +197,7 @@ def _runs(wish: Wish) -> list[RunDirectory]:
     for run in runs:
         if not run.evaluation.is_file():
             raise InputError(f"{str(run.path)!r} has no {run.evaluation.name}: the run has not finished")
-    names = [run.path.name for run in runs]
-    if len(set(names)) < len(names):
-        raise InputError(
-            f"two of the --runs are called {max(names, key=names.count)!r}: their rows could not be told apart"
-        )
+    check_names(runs)
     return runs
 
 
