@@ -211,7 +211,7 @@ def randomization(num_envs: int = 256, rounds: int = 9, steps: int = 20) -> None
         print(f"{name}: {np.median(ratios):.2f} ({ratios.min():.2f} to {ratios.max():.2f})", flush=True)
 
 
-def randomized_training(rounds: int = 5, steps: int = 81_920) -> None:
+def randomized_training(rounds: int = 3, steps: int = 40_960) -> None:
     """Steps per second of PPO's default training, physics and network together; the cases take turns."""
     from gridnav.agents import PPOAgent, PPOConfig
 
