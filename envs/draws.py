@@ -39,6 +39,7 @@ WIDENS, NARROWS = 0.85, 0.6
 STEP = 0.2
 """Of the strength, at each decision."""
 NO_DECISION = -1
+"""An episode that counts for no decision: its strength is not the curriculum's, or it began before the last one."""
 
 
 def wheel_factors(ratio: FloatArray) -> FloatArray:
